@@ -1,0 +1,1 @@
+"""Files this project did not make: manifest, cache, converters."""

@@ -1,0 +1,1 @@
+"""The avatar: neutral Gaussians, expression deltas, skinning, mouth sets; and its file."""

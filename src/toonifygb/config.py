@@ -1,0 +1,121 @@
+"""Every setting of the pipeline: one frozen dataclass per stage, three qualities, JSON in and out.
+
+One dial, ``quality``, sets the number of Gaussians, the steps and the resolution; everything else derives from it
+and can be overridden. This module imports no torch, so ``toonifygb --help`` stays instant. The attribute
+docstrings are the texts of ``--help``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+Quality = Literal["draft", "standard", "paper"]
+TrackOn = Literal["auto", "original", "stylized"]
+
+
+@dataclass(frozen=True)
+class StylizeConfig:
+    """Stage 1: how each frame is stylised."""
+
+    style: str = "toon"
+    """Built-in style: toon, paint, ink or none."""
+    strength: float = 1.0
+    """Blend between the original (0) and the full style (1)."""
+
+
+@dataclass(frozen=True)
+class FaceConfig:
+    """Finding and following one person's face."""
+
+    choose: str = "largest"
+    """Which face to follow where several are visible: largest, left, right, centre, or a number counted from
+    the left in the first frame that shows a face."""
+    min_score: float = 0.5
+    """Least face presence 0..1 that counts as found."""
+    max_lost_share: float = 0.5
+    """Largest share of frames without a face before the clip is refused."""
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """Fitting the head model to the landmarks of a clip."""
+
+    on: TrackOn = "auto"
+    """Video whose landmarks are fitted: original, stylized, or auto (the one whose landmarks are steadier)."""
+    n_shape: int = 80
+    """Identity coefficients fitted."""
+    iterations: int = 25
+    """Levenberg-Marquardt iterations at most."""
+    photometric: bool = False
+    """Refine expression and head shape against the pixels after the landmark fit."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Stage 2: training the Gaussian blendshapes."""
+
+    n_gaussians: int = 16_000
+    """Gaussians on the head surface."""
+    n_mouth_gaussians: int = 2_000
+    """Gaussians of the mouth interior, both sets together."""
+    resolution: int = 256
+    """Side of the square head crop that is trained on, px."""
+    steps: int = 3_000
+    """Optimiser steps, one frame each."""
+    sh_degree: int = 1
+    """Degree of the view-dependent colour, reached step by step."""
+    n_bases: int | None = None
+    """Expression blendshapes kept; all of the head model when unset."""
+    crop_scale: float = 2.2
+    """Side of the head crop in units of the face box."""
+    l1_weight: float = 0.8
+    """Weight of the mean absolute colour difference."""
+    dssim_weight: float = 0.2
+    """Weight of 1 - SSIM."""
+    alpha_weight: float = 10.0
+    """Weight of the squared difference between rendered opacity and head matte."""
+    mouth_weight: float = 100.0
+    """Weight of the mouth Gaussians' squared distance outside the mouth volume."""
+    loss: Literal["3dgb", "seed"] = "3dgb"
+    """3dgb: the weights above; seed: the paper's printed variant (0.2 L1 + 0.8 D-SSIM, one mean over both
+    mouth sets)."""
+    checkpoint_seconds: float = 30.0
+    """Time between checkpoints."""
+    test_share: float = 0.15
+    """Share of the clip's end held out from training."""
+    max_test_frames: int = 350
+    """Most frames held out."""
+    seed: int = 0
+    """Seed of every random choice."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """A whole run from clip to avatar."""
+
+    quality: Quality = "standard"
+    """draft: minutes; standard: a coffee; paper: the published regime."""
+    stylize: StylizeConfig = field(default_factory=StylizeConfig)
+    face: FaceConfig = field(default_factory=FaceConfig)
+    track: TrackConfig = field(default_factory=TrackConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+    max_frames: int | None = None
+    """Use only the first frames of the clip."""
+    backend: str = "auto"
+    """Rasteriser: auto, native or reference."""
+    threads: int | None = None
+    """Threads of the native engine; all cores when unset."""
+
+
+DRAFT = TrainConfig()
+STANDARD = TrainConfig(n_gaussians=32_000, n_mouth_gaussians=4_000, resolution=512, steps=7_000)
+PAPER = TrainConfig(n_gaussians=50_000, n_mouth_gaussians=14_000, resolution=512, steps=40_000, sh_degree=3)
+PRESETS: dict[Quality, TrainConfig] = {"draft": DRAFT, "standard": STANDARD, "paper": PAPER}
+
+
+def to_json(config: Any) -> str:
+    """Deterministic JSON text of a config dataclass."""
+    return json.dumps(dataclasses.asdict(config), indent=1, sort_keys=True)

@@ -1,0 +1,1 @@
+"""Finding faces, their 478 landmarks and the head's matte."""

@@ -1,0 +1,1 @@
+"""Pure maths: rotations, cameras, spherical harmonics, skinning, meshes, alignment."""

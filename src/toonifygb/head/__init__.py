@@ -1,0 +1,1 @@
+"""Head models with FLAME's functional interface."""

@@ -1,0 +1,1 @@
+"""Pure image maths; the only SSIM in the house."""

@@ -1,0 +1,1 @@
+"""Renderers: a readable reference, and the native CPU engine that must agree with it."""

@@ -1,0 +1,1 @@
+"""Explaining a clip's landmarks by a head model."""

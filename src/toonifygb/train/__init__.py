@@ -1,0 +1,1 @@
+"""Stage 2: training the avatar against a tracked clip."""

@@ -1,0 +1,1 @@
+"""Frames in, frames out, streaming. The only room that imports av."""
