@@ -8,9 +8,12 @@ docstrings are the texts of ``--help``.
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import json
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from toonifygb.errors import InputError
 
 Quality = Literal["draft", "standard", "paper"]
 TrackOn = Literal["auto", "original", "stylized"]
@@ -119,3 +122,80 @@ PRESETS: dict[Quality, TrainConfig] = {"draft": DRAFT, "standard": STANDARD, "pa
 def to_json(config: Any) -> str:
     """Deterministic JSON text of a config dataclass."""
     return json.dumps(dataclasses.asdict(config), indent=1, sort_keys=True)
+
+
+def for_quality(quality: Quality) -> RunConfig:
+    """Settings of a whole run at one quality."""
+    return RunConfig(quality=quality, train=PRESETS[quality])
+
+
+def override(config: RunConfig, assignment: str) -> RunConfig:
+    """Config with one setting changed, for instance ``train.steps=500``.
+
+    Args:
+        config: settings to start from.
+        assignment: dotted name, ``=``, and the value as JSON or as a bare word.
+
+    Raises:
+        InputError: no such setting (the nearest name is offered), or a value of the wrong kind.
+    """
+    name, separator, text = assignment.partition("=")
+    names = _setting_names(config)
+    if not separator or name not in names:
+        near = difflib.get_close_matches(name, names, n=1, cutoff=0.0)
+        raise InputError(
+            f"setting '{assignment}' is not of the form NAME=VALUE with a known name", f"nearest: {near[0]}"
+        )
+    stage, _, key = name.rpartition(".")
+    owner = getattr(config, stage) if stage else config
+    value = _parse(text, get_type_hints(type(owner))[key], name)
+    changed = dataclasses.replace(owner, **{key: value})
+    return dataclasses.replace(config, **{stage: changed}) if stage else changed
+
+
+def _setting_names(config: RunConfig) -> list[str]:
+    names = []
+    for entry in dataclasses.fields(config):
+        value = getattr(config, entry.name)
+        if dataclasses.is_dataclass(value):
+            names += [f"{entry.name}.{inner.name}" for inner in dataclasses.fields(value)]
+        else:
+            names.append(entry.name)
+    return names
+
+
+def _parse(text: str, kind: Any, name: str) -> Any:
+    """Value of ``kind`` written as ``text``."""
+    try:
+        value = json.loads(text)
+    except ValueError:
+        value = text
+    if get_origin(kind) is Literal:
+        choices = get_args(kind)
+        if value in choices:
+            return value
+        raise InputError(f"setting {name} is '{text}'; expected one of {', '.join(map(str, choices))}")
+    kinds = tuple(k for k in (get_args(kind) or (kind,)))
+    if float in kinds and type(value) is int:
+        return float(value)
+    if type(value) in kinds:
+        return value
+    expected = " or ".join("null" if k is type(None) else k.__name__ for k in kinds)
+    raise InputError(f"setting {name} is '{text}'; expected {expected}")
+
+
+def from_json(text: str) -> RunConfig:
+    """Settings from the text that ``to_json`` made.
+
+    Raises:
+        InputError: an unknown setting or a value of the wrong kind.
+    """
+    data = json.loads(text)
+    config = RunConfig()
+    for key, value in data.items():
+        if isinstance(value, dict):
+            for inner, leaf in value.items():
+                config = override(config, f"{key}.{inner}={json.dumps(leaf)}")
+        else:
+            config = override(config, f"{key}={json.dumps(value)}")
+    return config

@@ -1,1 +1,0 @@
-"""Files this project did not make: manifest, cache, converters."""

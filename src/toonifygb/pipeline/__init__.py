@@ -1,0 +1,1 @@
+"""Where the verbs meet: from a clip to an avatar, stage by stage, resumable."""

@@ -1,0 +1,318 @@
+"""The paper on one page: a clip becomes a stylised video, a track, an avatar, a preview and a report.
+
+Each function below is one stage: it says what it needs, what it leaves, and does the work by calling one room. The
+order of the calls in ``create`` is the order of the paper.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from toonifygb import avatar as avatars
+from toonifygb import face, head, stylize, track, train, video
+from toonifygb.config import from_json, to_json
+from toonifygb.errors import FaceError, InputError
+from toonifygb.pipeline.outcome import outcome
+from toonifygb.pipeline.source import Source
+from toonifygb.pipeline.stages import STATE_FILE
+from toonifygb.structures import Landmarks, TrackedSequence
+
+if TYPE_CHECKING:
+    from toonifygb.config import RunConfig
+    from toonifygb.pipeline.stages import Run
+    from toonifygb.progress import Progress
+
+MIN_FRAMES = 20
+"""Fewer tracked frames cannot train and judge an avatar: 15 % of 20 leave three to test on."""
+_CHUNK = 8
+
+
+def create(source: Source, run: Run, config: RunConfig) -> None:
+    """Runs every stage from the clip to the report.
+
+    Raises:
+        InputError: the clip or a setting cannot be used.
+        FaceError: no usable face in the clip.
+        Stopped: the user asked to stop; calling again goes on.
+    """
+    remember_request(source, run, config)
+    tracked, styled = track_stages(source, run, config)
+    check_trainable(run, source)
+    cut = cut_dataset(source, run, config, tracked, styled)
+    trained = train_avatar(run, config, cut, tracked)
+    outcome(source, run, config, trained)
+
+
+def track_only(source: Source, run: Run, config: RunConfig) -> None:
+    """Runs the stages up to the track and its overlay."""
+    remember_request(source, run, config)
+    track_stages(source, run, config)
+
+
+def track_stages(source: Source, run: Run, config: RunConfig) -> tuple[str, str]:
+    """Fingerprints of the track and of the stylised video it stands beside."""
+    found = find_landmarks(source, run, config)
+    styled = stylize_clip(source, run, config, found)
+    chosen = choose_landmarks(run, config, found, styled)
+    return fit_track(source, run, config, chosen), styled
+
+
+def remember_request(source: Source, run: Run, config: RunConfig) -> None:
+    """Keeps in the run what it was asked for, so that ``train RUN`` can ask again."""
+    run.state["request"] = {
+        "clip": str(source.path.resolve()),
+        "sha256": source.sha256,
+        "config": json.loads(to_json(config)),
+    }
+    run.save()
+
+
+def read_request(path: Path) -> tuple[Path, RunConfig]:
+    """Clip and settings of an existing run.
+
+    Raises:
+        InputError: the folder is not a run.
+    """
+    try:
+        request = json.loads((path / STATE_FILE).read_text())["request"]
+        return Path(request["clip"]), from_json(json.dumps(request["config"]))
+    except (OSError, KeyError, ValueError) as error:
+        raise InputError(
+            f"{path} is not a run of toonifygb ({type(error).__name__})", "make one with: toonifygb create CLIP"
+        ) from error
+
+
+def find_landmarks(source: Source, run: Run, config: RunConfig) -> str:
+    """478 landmarks in every frame of the original."""
+    path = run.work("landmarks.safetensors")
+
+    def work(progress: Progress) -> None:
+        clip = video.open_clip(source.path, max_frames=config.max_frames)
+        landmarks, report = face.find_landmarks(clip, config.face, n_frames=source.info.n_frames, progress=progress)
+        run.problems("video", list(clip.problems))
+        run.problems("face", list(report.problems))
+        face.save_landmarks(landmarks, path)
+
+    return run.stage(
+        "landmarks",
+        "finding the face",
+        inputs=[source.sha256, config.face, config.max_frames],
+        outputs=[path],
+        work=work,
+    )
+
+
+def stylize_clip(source: Source, run: Run, config: RunConfig, found: str) -> str:
+    """Stage 1: every frame in the chosen style, with the source's sound, size and pace."""
+    out = run.file("stylized.mp4")
+
+    def work(progress: Progress) -> None:
+        landmarks = face.load_landmarks(run.work("landmarks.safetensors"))
+        write_stylized(source, out, config, landmarks, run.work("stylized"), progress)
+
+    return run.stage(
+        "stylize",
+        f"stylising ({config.stylize.style})",
+        inputs=[found, config.stylize, config.max_frames],
+        outputs=[out],
+        work=work,
+    )
+
+
+def write_stylized(
+    source: Source,
+    out: Path,
+    config: RunConfig,
+    landmarks: Landmarks,
+    parts_dir: Path,
+    progress: Progress,
+) -> None:
+    """Streams the clip through its style into ``out``."""
+    stylizer = stylize.get(config.stylize.style)
+    n = landmarks.points.shape[0]
+    with closing(source.frames(config)) as frames:
+        state = stylize.prepare(stylizer, sample_frames(frames, n), landmarks)
+    info = source.info
+    with video.Writer(out, info.width, info.height, info.fps, audio_from=source.path) as writer:
+        frames = source.frames(config)
+        styled = stylize.stylize_frames(frames, landmarks, stylizer, state, strength=config.stylize.strength)
+        for done, frame in enumerate(styled, start=1):
+            writer.write(frame)
+            progress.update(done, n)
+
+
+def sample_frames(frames: Iterable[np.ndarray], n_frames: int, n_samples: int = 12) -> dict[int, np.ndarray]:
+    """Frames spread evenly over a clip, by number."""
+    wanted = set(np.linspace(0, max(n_frames - 1, 0), min(n_samples, n_frames)).round().astype(int).tolist())
+    samples = {}
+    for index, frame in enumerate(frames):
+        if index in wanted:
+            samples[index] = frame
+        if len(samples) == len(wanted):
+            break
+    return samples
+
+
+def choose_landmarks(run: Run, config: RunConfig, found: str, styled: str) -> str:
+    """Landmarks that the head model is fitted to: the original's or the stylised video's."""
+    out = run.work("landmarks_chosen.safetensors")
+
+    def work(progress: Progress) -> None:
+        original = face.load_landmarks(run.work("landmarks.safetensors"))
+        mode = config.track.on
+        if config.stylize.style == "none" or mode == "original":
+            choice, reason = "original", ""
+        else:
+            frames = video.read(run.file("stylized.mp4"))
+            try:
+                stylized, _ = face.find_landmarks(
+                    frames, config.face, n_frames=original.points.shape[0], progress=progress
+                )
+            except FaceError:
+                if mode == "stylized":
+                    raise
+                stylized = None
+            if mode == "stylized":
+                choice, reason = "stylized", ""
+            elif stylized is None:
+                choice, reason = "original", "the face is not found in the stylised video"
+            else:
+                choice, reason = track.choose_source(original, stylized)
+            if choice == "stylized" and stylized is not None:
+                original = stylized
+        run.state["track_on"] = {"choice": choice, "reason": reason}
+        if reason:
+            run.reporter.note(f"tracking the {choice} video: {reason}")
+        face.save_landmarks(original, out)
+
+    inputs = [found, styled, config.track.on, config.face]
+    return run.stage("source", "choosing what to track", inputs=inputs, outputs=[out], work=work)
+
+
+def fit_track(source: Source, run: Run, config: RunConfig, chosen: str) -> str:
+    """The head model fitted to the landmarks, and the overlay that shows how well."""
+    out, overlay_path = run.file("track.safetensors"), run.file("overlay.mp4")
+
+    def work(progress: Progress) -> None:
+        landmarks = face.load_landmarks(run.work("landmarks_chosen.safetensors"))
+        model = head.load("open")
+        sequence = track.fit(
+            landmarks,
+            model,
+            config.track,
+            fps=source.info.fps,
+            source_sha256=source.sha256,
+            progress=progress,
+        )
+        run.problems("track", track_problems(sequence))
+        with video.Writer(
+            overlay_path, source.info.width, source.info.height, source.info.fps, audio_from=source.path
+        ) as writer:
+            for index, frame in enumerate(video.read(run.file("stylized.mp4"), max_frames=sequence.n_frames)):
+                cropped = frame[: source.info.height, : source.info.width]
+                writer.write(track.draw_overlay(cropped, sequence, index, model))
+                progress.update(index + 1, sequence.n_frames)
+        track.save(sequence, out)
+
+    return run.stage(
+        "track", "tracking the head", inputs=[chosen, config.track], outputs=[out, overlay_path], work=work
+    )
+
+
+def track_problems(sequence: TrackedSequence) -> list[str]:
+    """What the fit says about the clip, one sentence each."""
+    lost = int((~sequence.tracked).sum())
+    if not lost:
+        return []
+    return [
+        f"the face is lost in {lost} of {sequence.n_frames} frames; the motion there is bridged and not trained on"
+    ]
+
+
+def check_trainable(run: Run, source: Source) -> None:
+    """Refuses clips too short for an avatar.
+
+    Raises:
+        InputError: fewer than ``MIN_FRAMES`` tracked frames.
+    """
+    usable = int(track.load(run.file("track.safetensors")).tracked.sum())
+    if usable < MIN_FRAMES:
+        raise InputError(
+            f"{source.path.name} has {usable} usable frame{'' if usable == 1 else 's'}; an avatar needs at least "
+            f"{MIN_FRAMES} with a face",
+            "record 10 to 30 seconds in which the head turns and the mouth moves",
+        )
+
+
+def cut_dataset(source: Source, run: Run, config: RunConfig, tracked: str, styled: str) -> str:
+    """The square head crops and mattes that Stage 2 is trained on."""
+    out = run.work("dataset")
+
+    def work(progress: Progress) -> None:
+        sequence = track.load(run.file("track.safetensors"))
+        model = head.load("open")
+        frames = (f[: source.info.height, : source.info.width] for f in video.read(run.file("stylized.mp4")))
+        pairs = head_frames(source.frames(config), frames, sequence, model)
+        train.build_dataset(pairs, sequence, model, config.train, out, progress=progress)
+
+    keys = ("resolution", "crop_scale", "test_share", "max_test_frames")
+    settings = {key: getattr(config.train, key) for key in keys}
+    return run.stage(
+        "dataset",
+        "cutting out the head",
+        inputs=[tracked, styled, settings],
+        outputs=[out],
+        work=work,
+    )
+
+
+def head_frames(
+    original: Iterable[np.ndarray],
+    styled: Iterable[np.ndarray],
+    sequence: TrackedSequence,
+    model: head.HeadModel,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Stylised frames with the matte of the head: hair kept, cut below the neck.
+
+    The person is segmented in the original, whose photographs the segmenter knows, and the edge is refined there.
+
+    Yields:
+        frame uint8 ``(h, w, 3)`` and matte float32 ``(h, w)``.
+    """
+    segmenter = face.PersonSegmenter()
+    boxes = track.head_boxes(sequence, model)
+    pairs = enumerate(zip(original, styled, strict=False))
+    while chunk := list(itertools.islice(pairs, _CHUNK)):
+        indices = [index for index, _ in chunk]
+        photos = np.stack([photo for _, (photo, _) in chunk])
+        persons = segmenter.segment(photos, boxes=boxes[indices])
+        for (index, (photo, frame)), person in zip(chunk, persons, strict=True):
+            region = track.head_region(sequence, index, model)
+            yield frame, face.head_matte(photo, person, region)
+
+
+def train_avatar(run: Run, config: RunConfig, cut: str, tracked: str) -> str:
+    """Stage 2: Gaussian blendshapes trained on the crops."""
+    out = run.file("avatar")
+
+    def work(progress: Progress) -> None:
+        trained = train.train(
+            train.load_dataset(run.work("dataset")),
+            track.load(run.file("track.safetensors")),
+            head.load("open"),
+            config.train,
+            run.work("training"),
+            backend=config.backend,
+            threads=config.threads,
+            progress=progress,
+        )
+        avatars.save(trained, out)
+
+    return run.stage("train", "training the avatar", inputs=[cut, tracked, config.train], outputs=[out], work=work)

@@ -1,0 +1,49 @@
+"""The whole pipeline on a synthetic talking head whose true motion is known."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from toonifygb import head, synthetic, track, video
+from toonifygb.pipeline.create import create
+from toonifygb.pipeline.source import open_source
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from toonifygb.config import RunConfig
+    from toonifygb.pipeline.stages import Run
+    from toonifygb.progress import Progress
+
+
+def demo(run: Run, config: RunConfig, *, seed: int, n_frames: int) -> None:
+    """Makes the clip, makes its avatar, and says how near the track is to the truth.
+
+    Args:
+        run: the run to work in; the clip becomes its ``input.mp4``.
+        config: settings of the pipeline.
+        seed: which synthetic person.
+        n_frames: length of the clip, 25 a second.
+    """
+    clip, truth_path = run.file("input.mp4"), run.work("truth.safetensors")
+
+    def work(progress: Progress) -> None:
+        render_subject(seed, n_frames, clip, truth_path, progress)
+
+    run.stage("clip", "making a talking head", inputs=[seed, n_frames], outputs=[clip, truth_path], work=work)
+    create(open_source(clip, config), run, config)
+    errors = synthetic.errors(track.load(run.file("track.safetensors")), track.load(truth_path), head.load("open"))
+    run.state["ground_truth"] = errors
+    run.save()
+
+
+def render_subject(seed: int, n_frames: int, clip: Path, truth_path: Path, progress: Progress) -> None:
+    """Writes a clip of a synthetic subject and its true track."""
+    rendered = synthetic.render_clip(synthetic.make_subject(seed), n_frames=n_frames)
+    sequence = rendered.sequence
+    size = (sequence.camera.width, sequence.camera.height)
+    with video.Writer(clip, *size, sequence.fps) as writer:
+        for done, frame in enumerate(rendered.frames, start=1):
+            writer.write(frame)
+            progress.update(done, n_frames)
+    track.save(sequence, truth_path)

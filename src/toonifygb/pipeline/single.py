@@ -1,0 +1,133 @@
+"""The single steps behind ``toonifygb stylize`` and ``toonifygb render``: files in, one file out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from toonifygb import avatar as avatars
+from toonifygb import face, track, video
+from toonifygb.errors import FaceError, InputError
+from toonifygb.pipeline.create import write_stylized
+from toonifygb.pipeline.source import open_source
+from toonifygb.pipeline.viewing import AvatarViewer, parse_color
+from toonifygb.structures import HeadMotion, Landmarks
+
+if TYPE_CHECKING:
+    from toonifygb.config import RunConfig
+    from toonifygb.pipeline.stages import Reporter
+
+
+def stylize_file(clip: Path, out: Path, config: RunConfig, reporter: Reporter) -> None:
+    """Writes ``clip`` in its style to ``out``; a clip without a face is stylised without the face's touches.
+
+    Raises:
+        InputError: the clip, the style or the output cannot be used.
+    """
+    if out.suffix.lower() != ".mp4":
+        raise InputError(f"output {out} does not end in .mp4; stylised clips are written as mp4")
+    source = open_source(clip, config)
+    progress = reporter.stage("landmarks", "finding the face")
+    opened = video.open_clip(clip, max_frames=config.max_frames)
+    try:
+        landmarks, report = face.find_landmarks(
+            opened, config.face, n_frames=source.info.n_frames, progress=progress
+        )
+        problems = list(report.problems)
+    except FaceError as error:
+        landmarks = _no_landmarks(source.info.width, source.info.height, opened.count())
+        problems = [f"{error.message}; stylising without the face's touches"]
+    for sentence in [*opened.problems, *problems]:
+        reporter.note(sentence)
+    progress = reporter.stage("stylize", f"stylising ({config.stylize.style})")
+    write_stylized(source, out, config, landmarks, progress)
+
+
+def _no_landmarks(width: int, height: int, n_frames: int) -> Landmarks:
+    return Landmarks(torch.full((n_frames, 478, 2), math.nan), torch.zeros(n_frames), width, height)
+
+
+@dataclass(frozen=True)
+class RenderRequest:
+    """What ``toonifygb render`` was asked for."""
+
+    avatar: Path
+    out: Path
+    motion: Path | None
+    expression: tuple[str, ...]
+    yaw_deg: float
+    pitch_deg: float
+    orbit_deg: float
+    size: int
+    n_frames: int | None
+    background: str
+    backend: str
+    threads: int | None
+
+
+def render_file(request: RenderRequest, reporter: Reporter) -> None:
+    """Writes a picture (.png) or a video (.mp4) of an avatar.
+
+    Raises:
+        InputError: no avatar there, an unknown expression or colour, an output of another kind.
+    """
+    model = avatars.load(_inside(request.avatar, "avatar"))
+    viewer = AvatarViewer(model, request.size, parse_color(request.background), request.backend, request.threads)
+    suffix = request.out.suffix.lower()
+    if suffix == ".png":
+        motion = _named_expression(model, request.expression)
+        frame = viewer.frame(motion, request.yaw_deg, request.pitch_deg)
+        video.save_png(request.out, frame)
+    elif suffix == ".mp4":
+        _render_video(request, model, viewer, reporter)
+    else:
+        raise InputError(
+            f"output {request.out} ends in '{suffix}'; expected .png for a picture or .mp4 for a video"
+        )
+
+
+def _inside(path: Path, name: str) -> Path:
+    """``path``, or the ``name`` inside it when ``path`` is a run."""
+    return path / name if (path / name).exists() else path
+
+
+def _named_expression(model: avatars.Avatar, weights: tuple[str, ...]) -> HeadMotion:
+    """The avatar's calm pose with the expression weights set by name."""
+    motion = model.rest_motion()
+    expression, joints = motion.expression.clone(), motion.joints.clone()
+    for item in weights:
+        name, separator, text = item.partition("=")
+        try:
+            value = float(text)
+        except ValueError:
+            separator = ""
+        if not separator:
+            raise InputError(f"expression '{item}' is not of the form NAME=WEIGHT, for instance jawOpen=0.5")
+        if name == "jawOpen":
+            joints[2, 0] = value * model.jaw_open_rad
+        elif name in model.expression_names:
+            expression[model.expression_names.index(name)] = value
+        else:
+            known = ", ".join(["jawOpen", *model.expression_names])
+            raise InputError(f"expression '{name}' does not exist; this avatar has: {known}")
+    return HeadMotion(expression, joints, motion.translation, motion.eyelids)
+
+
+def _render_video(request: RenderRequest, model: avatars.Avatar, viewer: AvatarViewer, reporter: Reporter) -> None:
+    """Plays a motion; the view swings once to each side when an orbit is asked for."""
+    motion, fps = model.training_motion, model.fps
+    if request.motion is not None:
+        sequence = track.load(_inside(request.motion, "track.safetensors"))
+        motion, fps = sequence.motion, sequence.fps
+    n = min(request.n_frames or motion.joints.shape[0], motion.joints.shape[0])
+    progress = reporter.stage("render", "rendering")
+    size = viewer.camera.width
+    with video.Writer(request.out, size, viewer.camera.height, fps) as writer:
+        for index in range(n):
+            swing = request.orbit_deg * math.sin(2 * math.pi * index / max(n, 1))
+            writer.write(viewer.frame(motion[index], request.yaw_deg + swing, request.pitch_deg))
+            progress.update(index + 1, n)

@@ -1,0 +1,40 @@
+"""The clip a run is made from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from toonifygb import stylize, video
+from toonifygb.structures import VideoInfo
+
+if TYPE_CHECKING:
+    from toonifygb.config import RunConfig
+
+
+@dataclass(frozen=True)
+class Source:
+    """A clip that was probed and hashed."""
+
+    path: Path
+    info: VideoInfo
+    sha256: str
+
+    def frames(self, config: RunConfig) -> Iterator[np.ndarray]:
+        """Its frames from the start, streaming."""
+        return video.read(self.path, max_frames=config.max_frames)
+
+
+def open_source(clip: Path, config: RunConfig) -> Source:
+    """The clip, probed and hashed; the style checked too, so that a wrong request fails before any work.
+
+    Raises:
+        InputError: no such file, not a video, no frames, or an unknown style.
+    """
+    info = video.probe(clip)
+    stylize.get(config.stylize.style)
+    return Source(clip, info, video.source_sha256(clip))

@@ -1,0 +1,77 @@
+"""Pictures of an avatar from any view."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from toonifygb import avatar as avatars
+from toonifygb import render
+from toonifygb.errors import InputError
+from toonifygb.geometry import cameras
+from toonifygb.structures import Camera, HeadMotion
+
+
+class AvatarViewer:
+    """Pictures of an avatar on a square canvas, from the training camera or turned about the head."""
+
+    def __init__(
+        self,
+        model: avatars.Avatar,
+        size: int,
+        background: torch.Tensor | None = None,
+        backend: str = "auto",
+        threads: int | None = None,
+    ) -> None:
+        self.model = model
+        self.renderer = render.get(backend, threads)
+        self.background = background
+        self.camera = resized(model.camera, size)
+
+    def frame(self, motion: HeadMotion, yaw_deg: float = 0.0, pitch_deg: float = 0.0) -> np.ndarray:
+        """uint8 RGB picture of one pose.
+
+        Args:
+            motion: expression and pose, no batch axis.
+            yaw_deg: view turned towards the subject's left, degrees.
+            pitch_deg: view turned upwards, degrees.
+        """
+        with torch.no_grad():
+            camera = self.camera
+            if yaw_deg or pitch_deg:
+                pivot = motion.translation + self.model.rest_joints[0]
+                camera = cameras.orbit(camera, pivot, math.radians(yaw_deg), math.radians(pitch_deg))
+            image = self.renderer.render(self.model.pose(motion), camera, background=self.background)
+        return to_uint8(image.color)
+
+
+def to_uint8(color: torch.Tensor) -> np.ndarray:
+    """Float image 0..1 as rounded uint8."""
+    return (color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+
+
+def resized(camera: Camera, size: int) -> Camera:
+    """The same square view at another number of pixels."""
+    scale = size / camera.width
+    K = camera.K.clone()
+    K[:2] *= scale
+    return Camera(K, camera.world_to_camera, size, round(camera.height * scale))
+
+
+def parse_color(text: str) -> torch.Tensor:
+    """RGB 0..1 of a colour name or ``#rrggbb``.
+
+    Raises:
+        InputError: not a colour.
+    """
+    named = {"black": "#000000", "white": "#ffffff", "grey": "#808080", "gray": "#808080"}
+    code = named.get(text.lower(), text)
+    try:
+        if len(code) != 7 or code[0] != "#":
+            raise ValueError
+        value = bytes.fromhex(code[1:])
+    except ValueError:
+        raise InputError(f"background '{text}' is not a colour; expected black, white or #rrggbb") from None
+    return torch.tensor(list(value), dtype=torch.float32) / 255
