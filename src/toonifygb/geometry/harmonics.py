@@ -115,9 +115,9 @@ def _band_rotation(rotations: Tensor, band: int) -> Tensor:
 def _probes(band: int) -> tuple[Tensor, Tensor]:
     """Directions spread evenly over the sphere, and the pseudo-inverse of the band's basis in them.
 
-    Twice as many directions as functions on a golden-angle spiral keep the condition number below 2.
+    Three times as many directions as functions on a golden-angle spiral keep the condition number below 1.5.
     """
-    n = 2 * (2 * band + 1)
+    n = 3 * (2 * band + 1)
     i = torch.arange(n, dtype=torch.float64)
     z = 1 - (2 * i + 1) / n
     angle = i * math.pi * (3 - math.sqrt(5))
