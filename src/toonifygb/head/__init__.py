@@ -1,1 +1,28 @@
 """Head models with FLAME's functional interface."""
+
+from __future__ import annotations
+
+from toonifygb.errors import InputError
+from toonifygb.head.base import JOINTS, PARENTS, PARTS, HeadModel
+from toonifygb.head.flame import from_arrays
+from toonifygb.head.open_head import load_open_head
+
+__all__ = ["JOINTS", "PARENTS", "PARTS", "HeadModel", "available", "from_arrays", "load", "load_open_head"]
+
+_LOADERS = {"open": load_open_head}
+
+
+def available() -> tuple[str, ...]:
+    """Names that ``load`` knows."""
+    return tuple(_LOADERS)
+
+
+def load(name: str = "open") -> HeadModel:
+    """Head model by name, float32 on the CPU.
+
+    Raises:
+        InputError: no such model.
+    """
+    if name not in _LOADERS:
+        raise InputError(f"there is no head model {name!r}, known are {', '.join(_LOADERS)}", "use 'open'")
+    return _LOADERS[name]()
