@@ -66,7 +66,7 @@ def decode(path: Path) -> HeadModel:
 
     n_vertices = stored["template"].shape[0]
 
-    def scattered(key: str) -> Float[Tensor, "v *n"]:
+    def scattered(key: str) -> Float[Tensor, "v 3 k"]:
         rows = real(key)
         return rows.new_zeros(n_vertices, *rows.shape[1:]).index_copy(0, whole(f"{key}_rows"), rows)
 
