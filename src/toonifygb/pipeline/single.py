@@ -14,8 +14,10 @@ from toonifygb import face, track, video
 from toonifygb.errors import FaceError, InputError
 from toonifygb.pipeline.create import write_stylized
 from toonifygb.pipeline.source import open_source
-from toonifygb.pipeline.viewing import AvatarViewer, parse_color
-from toonifygb.structures import HeadMotion, Landmarks
+from toonifygb.pipeline.viewing import AvatarViewer, parse_color, posed
+from toonifygb.structures import Landmarks
+
+TRACK_FILE = "track.safetensors"
 
 if TYPE_CHECKING:
     from toonifygb.config import RunConfig
@@ -79,7 +81,7 @@ def render_file(request: RenderRequest, reporter: Reporter) -> None:
     viewer = AvatarViewer(model, request.size, parse_color(request.background), request.backend, request.threads)
     suffix = request.out.suffix.lower()
     if suffix == ".png":
-        motion = _named_expression(model, request.expression)
+        motion = posed(model, parse_weights(request.expression))
         frame = viewer.frame(motion, request.yaw_deg, request.pitch_deg)
         video.save_png(request.out, frame)
     elif suffix == ".mp4":
@@ -95,38 +97,39 @@ def _inside(path: Path, name: str) -> Path:
     return path / name if (path / name).exists() else path
 
 
-def _named_expression(model: avatars.Avatar, weights: tuple[str, ...]) -> HeadMotion:
-    """The avatar's calm pose with the expression weights set by name."""
-    motion = model.rest_motion()
-    expression, joints = motion.expression.clone(), motion.joints.clone()
-    for item in weights:
-        name, separator, text = item.partition("=")
+def parse_weights(items: tuple[str, ...]) -> dict[str, float]:
+    """``("jawOpen=0.5",)`` → ``{"jawOpen": 0.5}``.
+
+    Raises:
+        InputError: an item of another form.
+    """
+    weights = {}
+    for item in items:
+        name, _, text = item.partition("=")
         try:
-            value = float(text)
+            weights[name] = float(text)
         except ValueError:
-            separator = ""
-        if not separator:
-            raise InputError(f"expression '{item}' is not of the form NAME=WEIGHT, for instance jawOpen=0.5")
-        if name == "jawOpen":
-            joints[2, 0] = value * model.jaw_open_rad
-        elif name in model.expression_names:
-            expression[model.expression_names.index(name)] = value
-        else:
-            known = ", ".join(["jawOpen", *model.expression_names])
-            raise InputError(f"expression '{name}' does not exist; this avatar has: {known}")
-    return HeadMotion(expression, joints, motion.translation, motion.eyelids)
+            raise InputError(
+                f"expression '{item}' is not of the form NAME=WEIGHT, for instance jawOpen=0.5"
+            ) from None
+    return weights
 
 
 def _render_video(request: RenderRequest, model: avatars.Avatar, viewer: AvatarViewer, reporter: Reporter) -> None:
     """Plays a motion; the view swings once to each side when an orbit is asked for."""
-    motion, fps = model.training_motion, model.fps
-    if request.motion is not None:
-        sequence = track.load(_inside(request.motion, "track.safetensors"))
-        motion, fps = sequence.motion, sequence.fps
+    place = _inside(request.motion, TRACK_FILE) if request.motion else request.avatar / TRACK_FILE
+    if not place.is_file():
+        place = request.avatar.parent / TRACK_FILE
+    if not place.is_file():
+        raise InputError(
+            f"no motion to play: {request.avatar} lies in no run", "pass a track.safetensors or a run with --motion"
+        )
+    sequence = track.load(place)
+    motion = sequence.motion
     n = min(request.n_frames or motion.joints.shape[0], motion.joints.shape[0])
     progress = reporter.stage("render", "rendering")
     size = viewer.camera.width
-    with video.Writer(request.out, size, viewer.camera.height, fps) as writer:
+    with video.Writer(request.out, size, viewer.camera.height, sequence.fps) as writer:
         for index in range(n):
             swing = request.orbit_deg * math.sin(2 * math.pi * index / max(n, 1))
             writer.write(viewer.frame(motion[index], request.yaw_deg + swing, request.pitch_deg))

@@ -28,7 +28,12 @@ class AvatarViewer:
         self.model = model
         self.renderer = render.get(backend, threads)
         self.background = background
-        self.camera = resized(model.camera, size)
+        self.size = size
+        self.look_through(model.camera)
+
+    def look_through(self, camera: Camera) -> None:
+        """Takes another camera's square view from now on."""
+        self.camera = resized(camera, self.size)
 
     def frame(self, motion: HeadMotion, yaw_deg: float = 0.0, pitch_deg: float = 0.0) -> np.ndarray:
         """uint8 RGB picture of one pose.
@@ -45,6 +50,38 @@ class AvatarViewer:
                 camera = cameras.orbit(camera, pivot, math.radians(yaw_deg), math.radians(pitch_deg))
             image = self.renderer.render(self.model.pose(motion), camera, background=self.background)
         return to_uint8(image.color)
+
+
+_JAW_OPEN_RAD = 0.426
+"""Jaw rotation that the artist's unit ``jawOpen`` = 1 stands for."""
+
+
+def posed(model: avatars.Avatar, weights: dict[str, float]) -> HeadMotion:
+    """The avatar's mean motion with a calm face, changed by expression weights by name.
+
+    Args:
+        model: the avatar.
+        weights: expression unit → weight; besides the avatar's own units ``jawOpen`` (a joint) and
+            ``eyesClosed`` (both lids).
+
+    Raises:
+        InputError: an unknown name.
+    """
+    motion = model.motion_mean
+    names = model.blendshape_names[: model.n_expressions]
+    expression, joints = motion.expression.clone(), motion.joints.clone()
+    eyelids = motion.eyelids.clone()
+    for name, value in weights.items():
+        if name == "jawOpen":
+            joints[2, 0] = value * _JAW_OPEN_RAD
+        elif name == "eyesClosed":
+            eyelids[:] = value
+        elif name in names:
+            expression[names.index(name)] = value
+        else:
+            known = ", ".join(["jawOpen", "eyesClosed", *names])
+            raise InputError(f"expression '{name}' does not exist; this avatar has: {known}")
+    return HeadMotion(expression, joints, motion.translation, eyelids)
 
 
 def to_uint8(color: torch.Tensor) -> np.ndarray:

@@ -1,0 +1,245 @@
+"""What a run leaves for people: held-out scores, the preview video, the report and ``metrics.json``."""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from toonifygb import __version__, metrics, track, train, video
+from toonifygb import avatar as avatars
+from toonifygb.pipeline import pictures
+from toonifygb.pipeline.report import Curve, Picture, Report, render_report
+from toonifygb.pipeline.stages import peak_memory_mb, write_json
+from toonifygb.pipeline.viewing import AvatarViewer, posed
+
+if TYPE_CHECKING:
+    from toonifygb.config import RunConfig
+    from toonifygb.pipeline.source import Source
+    from toonifygb.pipeline.stages import Run
+    from toonifygb.progress import Progress
+    from toonifygb.structures import TrackedSequence
+
+_PANEL = 384
+"""Side of each of the preview's four panels, px."""
+_SWING_DEG, _SWING_SECONDS = 35.0, 6.0
+"""The moving side view: how far it turns to each side, and how long one swing there and back takes."""
+_LABELS = ("input", "stylised", "avatar", "avatar, moving view")
+_VIEWS_DEG = (-50.0, -25.0, 0.0, 25.0, 50.0)
+_EXPRESSIONS: tuple[tuple[str, dict[str, float]], ...] = (
+    ("calm", {}),
+    ("jaw open", {"jawOpen": 0.5}),
+    ("smile", {"mouthSmileLeft": 0.9, "mouthSmileRight": 0.9}),
+    ("pucker", {"mouthPucker": 0.9}),
+    ("brows up", {"browInnerUp": 0.9, "browOuterUpLeft": 0.9, "browOuterUpRight": 0.9}),
+    ("eyes closed", {"eyesClosed": 1.0}),
+)
+
+
+def outcome(source: Source, run: Run, config: RunConfig, trained: str) -> None:
+    """Judges the avatar on the held-out frames and shows it."""
+    scored = score(source, run, config, trained)
+    shown = make_preview(source, run, config, trained)
+    write_report(source, run, config, scored, shown)
+
+
+def score(source: Source, run: Run, config: RunConfig, trained: str) -> str:
+    """Held-out scores of the avatar and steadiness of the stylised video."""
+    out = run.work("scores.json")
+
+    def work(progress: Progress) -> None:
+        dataset = train.load_dataset(run.work("dataset"))
+        sequence = track.load(run.file("track.safetensors"))
+        held_out = train.evaluate(
+            avatars.load(run.file("avatar")),
+            dataset,
+            sequence,
+            dataset.split.test,
+            backend=config.backend,
+            threads=config.threads,
+            progress=progress,
+        )
+        steadiness = metrics.steadiness(video.read(run.file("stylized.mp4")))
+        write_json(out, {**held_out, **steadiness})
+
+    return run.stage("scores", "judging on held-out frames", inputs=[trained], outputs=[out], work=work)
+
+
+def make_preview(source: Source, run: Run, config: RunConfig, trained: str) -> str:
+    """Side by side: input, stylised, avatar at the same pose, avatar from a moving view."""
+    out = run.file("preview.mp4")
+
+    def work(progress: Progress) -> None:
+        sequence = track.load(run.file("track.safetensors"))
+        height = _PANEL + pictures.LABEL_HEIGHT
+        with video.Writer(out, 4 * _PANEL, height, source.info.fps, audio_from=source.path) as writer:
+            for index, panels in enumerate(preview_panels(source, run, config, sequence)):
+                writer.write(pictures.row(panels, _LABELS))
+                progress.update(index + 1, sequence.n_frames)
+
+    return run.stage("preview", "filming the preview", inputs=[trained], outputs=[out], work=work)
+
+
+def preview_panels(
+    source: Source, run: Run, config: RunConfig, sequence: TrackedSequence
+) -> Iterator[list[np.ndarray]]:
+    """The four panels of every frame, uint8 RGB squares of one size."""
+    dataset = train.load_dataset(run.work("dataset"))
+    viewer = AvatarViewer(avatars.load(run.file("avatar")), _PANEL, backend=config.backend, threads=config.threads)
+    period = _SWING_SECONDS * source.info.fps
+    for index, photo in enumerate(source.frames(config)):
+        if index == dataset.n_frames:
+            return
+        motion = sequence.motion[index]
+        viewer.look_through(dataset.camera(index))
+        swing = _SWING_DEG * math.sin(2 * math.pi * index / period)
+        yield [
+            pictures.fit(train.crop(photo, dataset.boxes[index], dataset.size), _PANEL),
+            pictures.fit(dataset.frames[index], _PANEL),
+            viewer.frame(motion),
+            viewer.frame(motion, yaw_deg=swing),
+        ]
+
+
+def write_report(source: Source, run: Run, config: RunConfig, scored: str, shown: str) -> None:
+    """``report.html`` and ``metrics.json``."""
+    sheet = run.work("pictures")
+
+    def work(progress: Progress) -> None:
+        sheet.mkdir(exist_ok=True)
+        for name, image in report_pictures(run, config).items():
+            (sheet / f"{name}.jpg").write_bytes(video.jpeg(image))
+
+    run.stage("report", "writing the report", inputs=[scored, shown], outputs=[sheet], work=work)
+    scores = json.loads(run.work("scores.json").read_text())
+    values = metrics_record(source, run, config, scores)
+    write_json(run.file("metrics.json"), values)
+    page = render_report(report_page(source, run, config, values))
+    temporary = run.file(".report.html.part")
+    temporary.write_text(page, encoding="utf-8")
+    temporary.replace(run.file("report.html"))
+
+
+def metrics_record(source: Source, run: Run, config: RunConfig, scores: dict[str, Any]) -> dict[str, Any]:
+    """Everything measured in a run, by name."""
+    sequence = track.load(run.file("track.safetensors"))
+    dataset = train.load_dataset(run.work("dataset"))
+    model = avatars.load(run.file("avatar"))
+    errors = sequence.error_px[sequence.tracked]
+    stages = run.state["stages"]
+    return {
+        "clip": source.path.name,
+        "clip_sha256": source.sha256,
+        "style": config.stylize.style,
+        "quality": config.quality,
+        **scores,
+        "lpips": None,
+        "n_frames": sequence.n_frames,
+        "n_train": len(dataset.split.train),
+        "n_test": len(dataset.split.test),
+        "resolution": dataset.size,
+        "n_gaussians": model.n,
+        "landmark_error_px": float(errors.mean()),
+        "track_on": run.state["track_on"]["choice"],
+        "seconds": run.seconds(),
+        "peak_memory_mb": max([peak_memory_mb(), *(entry["peak_memory_mb"] for entry in stages.values())]),
+        "versions": {
+            "toonifygb": __version__,
+            "torch": str(torch.__version__),
+            "python": platform.python_version(),
+        },
+        "problems": [sentence for sentences in run.state["problems"].values() for sentence in sentences],
+    }
+
+
+def report_pictures(run: Run, config: RunConfig) -> dict[str, np.ndarray]:
+    """The report's pictures by name, uint8 RGB."""
+    dataset = train.load_dataset(run.work("dataset"))
+    sequence = track.load(run.file("track.safetensors"))
+    model = avatars.load(run.file("avatar"))
+    viewer = AvatarViewer(model, dataset.size, backend=config.backend, threads=config.threads)
+    middle = model.motion_mean
+    test = dataset.split.test or dataset.split.train
+    held_out = []
+    for index in sorted({test[0], test[len(test) // 2], test[-1]}):
+        viewer.look_through(dataset.camera(index))
+        target = (dataset.target(index)[0] * 255).round().to(torch.uint8).numpy()
+        image = viewer.frame(sequence.motion[index])
+        held_out.append(
+            pictures.row(
+                [target, image, pictures.error_map(image, target)], ("held out", "avatar", "difference × 4"), 360
+            )
+        )
+    viewer.look_through(dataset.camera(dataset.split.train[len(dataset.split.train) // 2]))
+    views = [viewer.frame(middle, yaw_deg=yaw) for yaw in _VIEWS_DEG]
+    faces = [viewer.frame(posed(model, weights)) for _, weights in _EXPRESSIONS]
+    return {
+        "1-held-out": pictures.stack(held_out),
+        "2-views": pictures.row(views, [f"{yaw:+.0f} deg" for yaw in _VIEWS_DEG], 240),
+        "3-expressions": pictures.row(faces, [name for name, _ in _EXPRESSIONS], 200),
+        "4-tracking": overlay_sheet(run, sequence),
+    }
+
+
+def overlay_sheet(run: Run, sequence: TrackedSequence) -> np.ndarray:
+    """Four moments of the overlay video side by side."""
+    wanted = set(np.linspace(0, sequence.n_frames - 1, 4).round().astype(int).tolist())
+    frames = [f for i, f in enumerate(video.read(run.file("overlay.mp4"))) if i in wanted]
+    return np.concatenate(frames, axis=1)
+
+
+_CAPTIONS = {
+    "1-held-out": "Frames the training never saw: the target, the avatar, and the difference.",
+    "2-views": "The mean pose from new views.",
+    "3-expressions": "Expressions set by name.",
+    "4-tracking": "The head model on the clip.",
+}
+
+
+def report_page(source: Source, run: Run, config: RunConfig, values: dict[str, Any]) -> Report:
+    """The report's record from the run's files and figures."""
+    sheet = run.work("pictures")
+    seconds = list(values["seconds"].items())
+    tiles = [
+        ("PSNR, held out", f"{values['psnr']:.2f} dB"),
+        ("SSIM, held out", f"{values['ssim']:.4f}"),
+        ("landmark error", f"{values['landmark_error_px']:.2f} px"),
+        ("Gaussians", f"{values['n_gaussians']:,}"),
+        ("steadiness (ITF)", f"{values['itf']:.1f} dB"),
+        ("time", f"{sum(s for _, s in seconds) / 60:.1f} min"),
+    ]
+    facts = [
+        ("clip", values["clip"]),
+        ("frames", f"{values['n_frames']} ({values['n_train']} trained on, {values['n_test']} held out)"),
+        ("crop", f"{values['resolution']} px square"),
+        ("tracked video", values["track_on"]),
+        ("ISI", f"{values['isi']:.4f}"),
+        ("peak memory", f"{values['peak_memory_mb']:.0f} MB"),
+        *((name, str(version)) for name, version in values["versions"].items()),
+    ]
+    captions = [Picture((sheet / f"{name}.jpg").read_bytes(), caption) for name, caption in _CAPTIONS.items()]
+    return Report(
+        title=f"{source.path.stem} · {config.stylize.style}",
+        lead=f"{config.quality} quality, made by toonifygb {__version__}",
+        scores=tiles,
+        pictures=captions,
+        curves=training_curves(run.work("training")),
+        stages=seconds,
+        problems=values["problems"],
+        facts=facts,
+    )
+
+
+def training_curves(folder: Path) -> list[Curve]:
+    """Loss over the training steps, from the lines the training wrote."""
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    lines = [line for line in lines if "loss" in line]
+    if len(lines) < 2:
+        return []
+    return [Curve("training loss", [line["step"] for line in lines], [line["loss"] for line in lines])]
