@@ -55,12 +55,13 @@ def _decibel(mean_square: Tensor) -> Tensor:
 
 def _blur(images: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
     """Images under the SSIM window: two one-dimensional passes, zeros outside."""
-    kernel = torch.tensor(_window(), dtype=images.dtype, device=images.device)
-    flat = images.reshape(-1, 1, *images.shape[-2:])
-    half = SSIM_WINDOW // 2
-    flat = torch.nn.functional.conv2d(flat, kernel.view(1, 1, -1, 1), padding=(half, 0))
-    flat = torch.nn.functional.conv2d(flat, kernel.view(1, 1, 1, -1), padding=(0, half))
-    return flat.reshape(images.shape)
+    # All images as channels of one: depthwise convolution is some 25 times faster than as many single channels.
+    channels = images.reshape(1, -1, *images.shape[-2:])
+    n, half = channels.shape[1], SSIM_WINDOW // 2
+    kernel = torch.tensor(_window(), dtype=images.dtype, device=images.device).expand(n, 1, -1)
+    channels = torch.nn.functional.conv2d(channels, kernel[..., :, None], padding=(half, 0), groups=n)
+    channels = torch.nn.functional.conv2d(channels, kernel[..., None, :], padding=(0, half), groups=n)
+    return channels.reshape(images.shape)
 
 
 @cache
