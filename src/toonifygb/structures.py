@@ -19,15 +19,16 @@ Leading batch axes are written ``*b``. Records are frozen: a stage returns a new
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeAlias, TypeVar
 
 from torch import Tensor
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    import numpy as np
     import torch
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Bool, Float, Int, UInt8
 
 T = TypeVar("T", bound="TensorRecord")
 
@@ -214,5 +215,5 @@ class Split:
 
 
 Scheme = Literal["mediapipe478"]
-Frame = "UInt8[np.ndarray, 'h w 3']"
+Frame: TypeAlias = "UInt8[np.ndarray, 'h w 3']"
 """An image at the file boundary: numpy uint8 RGB, contiguous."""
