@@ -1,1 +1,10 @@
 """The avatar: neutral Gaussians, expression deltas, skinning, mouth sets; and its file."""
+
+from __future__ import annotations
+
+from toonifygb.avatar.init import Views, init_avatar
+from toonifygb.avatar.model import POSE_DRIVERS, Avatar, PoseDrivers
+from toonifygb.avatar.mouth import MouthVolume
+from toonifygb.avatar.save import load, save
+
+__all__ = ["POSE_DRIVERS", "Avatar", "MouthVolume", "PoseDrivers", "Views", "init_avatar", "load", "save"]

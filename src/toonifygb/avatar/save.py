@@ -1,0 +1,223 @@
+"""The avatar's folder: ``avatar.safetensors`` (every tensor) and ``avatar.json`` (names, sizes, facts).
+
+The pair is self-contained: rendering needs nothing else on disk. Tensor names are the dotted field names of
+``Avatar`` (``neutral.means``, ``deltas.sh``, ``camera.K`` …). Deltas are stored only for the first Gaussians, up to
+the last one that moves; the rest are zero. The JSON is written last and holds the digest of the tensors, so a
+folder is either complete or refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from toonifygb.avatar.model import Avatar, PoseDrivers
+from toonifygb.errors import InputError
+from toonifygb.structures import Camera, GaussianParams, HeadMotion, TensorRecord
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+FORMAT = "toonifygb-avatar"
+VERSION = 1
+TENSORS = "avatar.safetensors"
+FACTS = "avatar.json"
+_RECORDS: dict[str, type[TensorRecord]] = {
+    "neutral": GaussianParams,
+    "deltas": GaussianParams,
+    "drivers": PoseDrivers,
+    "mouth_upper": GaussianParams,
+    "mouth_lower": GaussianParams,
+    "motion_lower": HeadMotion,
+    "motion_upper": HeadMotion,
+    "motion_mean": HeadMotion,
+    "camera": Camera,
+    "full_camera": Camera,
+}
+_PLAIN = ("skin_weights", "pose_basis", "rest_joints", "joint_expression_basis", "shape")
+_PLAIN_MOUTH = ("mouth_upper_weights", "mouth_lower_weights")
+
+
+def save(avatar: Avatar, folder: Path | str, *, compact: bool = False) -> None:
+    """Writes the avatar; an older one in the folder is replaced only when the new one is complete.
+
+    Args:
+        avatar: what to write.
+        folder: created when absent.
+        compact: store the deltas in half precision; costs less than 0.1 dB and halves the file.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    tensors = _apart(_tensors(_trimmed(avatar)))
+    if compact:
+        tensors = {n: t.half() if n.startswith("deltas.") else t for n, t in tensors.items()}
+    temporary = folder / f".{TENSORS}.{os.getpid()}"
+    save_file(tensors, temporary)
+    facts = _facts(avatar) | {"tensors_sha256": _digest(temporary), "compact": compact}
+    note = folder / f".{FACTS}.{os.getpid()}"
+    note.write_text(json.dumps(facts, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    temporary.replace(folder / TENSORS)
+    note.replace(folder / FACTS)
+
+
+def load(folder: Path | str) -> Avatar:
+    """Reads an avatar written by ``save``; half-precision deltas are widened.
+
+    Raises:
+        InputError: the folder holds no avatar, a damaged one, or one of another version.
+    """
+    folder = Path(folder)
+    facts = _read_facts(folder)
+    path = folder / TENSORS
+    if not path.is_file():
+        raise InputError(f"{path} is missing", "copy the whole avatar folder")
+    if _digest(path) != facts["tensors_sha256"]:
+        raise InputError(f"{path} does not match {FACTS} beside it", "copy the avatar again or train it anew")
+    try:
+        tensors = load_file(path)
+    except SafetensorError as error:
+        raise InputError(f"{path} is damaged ({error})", "copy the avatar again or train it anew") from error
+    return _assemble(tensors, facts, path)
+
+
+def _trimmed(avatar: Avatar) -> Avatar:
+    """The avatar with deltas cut after the last Gaussian that any of them changes (one is always kept)."""
+    moves = torch.zeros(avatar.neutral.n, dtype=torch.bool)
+    for part in fields(avatar.deltas):
+        delta = getattr(avatar.deltas, part.name)
+        moves |= (delta != 0).flatten(2).any(-1).any(0) if delta.ndim > 2 else (delta != 0).any(0)
+    last = int(moves.nonzero().max()) + 1 if bool(moves.any()) else 1
+    return replace(avatar, deltas=avatar.deltas.map(lambda delta: delta[:, :last]))
+
+
+def _padded(deltas: GaussianParams, n: int) -> GaussianParams:
+    """Inverse of ``_trimmed``: float32 deltas of all n Gaussians."""
+
+    def pad(delta: Tensor) -> Tensor:
+        full = torch.zeros(delta.shape[0], n, *delta.shape[2:])
+        full[:, : delta.shape[1]] = delta
+        return full
+
+    return deltas.map(pad)
+
+
+def _tensors(avatar: Avatar) -> dict[str, Tensor]:
+    named = {name: getattr(avatar, name) for name in (*_PLAIN, *_PLAIN_MOUTH)}
+    for name in _RECORDS:
+        record = getattr(avatar, name)
+        for part in fields(record) if record is not None else ():
+            value = getattr(record, part.name)
+            if isinstance(value, torch.Tensor):
+                named[f"{name}.{part.name}"] = value
+    return named
+
+
+def _apart(named: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Contiguous tensors of which no two share memory, as the file format demands."""
+    seen: set[int] = set()
+    apart = {}
+    for name, tensor in named.items():
+        tensor = tensor.contiguous()
+        place = tensor.untyped_storage().data_ptr()
+        apart[name] = tensor.clone() if place in seen else tensor
+        seen.add(place)
+    return apart
+
+
+def _facts(avatar: Avatar) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "n_gaussians": avatar.neutral.n,
+        "n_mouth": [avatar.mouth_upper.n, avatar.mouth_lower.n],
+        "sh_degree": avatar.sh_degree,
+        "blendshape_names": list(avatar.blendshape_names),
+        "n_expressions": avatar.n_expressions,
+        "n_eyelids": avatar.n_eyelids,
+        "has_drivers": avatar.drivers is not None,
+        "pose_features": list(avatar.pose_features),
+        "parents": list(avatar.parents),
+        "camera_size": [avatar.camera.width, avatar.camera.height],
+        "full_camera_size": [avatar.full_camera.width, avatar.full_camera.height],
+        "head_model": avatar.head_model,
+        "meta": avatar.meta,
+    }
+
+
+def _read_facts(folder: Path) -> dict[str, Any]:
+    path = folder / FACTS
+    if not path.is_file():
+        raise InputError(f"no avatar in {folder}: {FACTS} is missing", "give the folder that holds avatar.json")
+    try:
+        facts = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise InputError(f"{path} is not valid JSON ({error})", "copy the avatar again or train it anew") from error
+    if not isinstance(facts, dict) or facts.get("format") != FORMAT:
+        raise InputError(f"{path} does not describe an avatar", "give the folder that training wrote")
+    if facts.get("version") != VERSION:
+        raise InputError(
+            f"{path} has format version {facts.get('version')}; this program reads version {VERSION}",
+            "update toonifygb or train the avatar anew",
+        )
+    return facts
+
+
+def _assemble(tensors: dict[str, Tensor], facts: dict[str, Any], path: Path) -> Avatar:
+    """The record from its parts, after checking that exactly the expected tensors are there and fit together."""
+    records = {n: c for n, c in _RECORDS.items() if n != "drivers" or facts["has_drivers"]}
+    wanted = {*_PLAIN, *_PLAIN_MOUTH}
+    for name, kind in records.items():
+        wanted |= {f"{name}.{p.name}" for p in fields(kind) if p.name not in {"width", "height"}}
+    if wanted != set(tensors):
+        odd = sorted(wanted.symmetric_difference(tensors))
+        raise InputError(f"{path} has missing or unknown tensors: {', '.join(odd[:5])}", "train the avatar anew")
+    extra = {
+        "camera": dict(zip(("width", "height"), facts["camera_size"], strict=True)),
+        "full_camera": dict(zip(("width", "height"), facts["full_camera_size"], strict=True)),
+    }
+    built: dict[str, Any] = {name: tensors[name] for name in (*_PLAIN, *_PLAIN_MOUTH)}
+    for name, kind in records.items():
+        parts = {p.name: tensors[f"{name}.{p.name}"] for p in fields(kind) if f"{name}.{p.name}" in tensors}
+        built[name] = kind(**parts, **extra.get(name, {}))
+    built["deltas"] = _padded(built["deltas"], facts["n_gaussians"])
+    built.setdefault("drivers", None)
+    avatar = Avatar(
+        **built,
+        blendshape_names=tuple(facts["blendshape_names"]),
+        n_expressions=facts["n_expressions"],
+        n_eyelids=facts["n_eyelids"],
+        pose_features=tuple(facts["pose_features"]),
+        parents=tuple(facts["parents"]),
+        head_model=facts["head_model"],
+        meta=facts["meta"],
+    )
+    _check_sizes(avatar, facts, path)
+    return avatar
+
+
+def _check_sizes(avatar: Avatar, facts: dict[str, Any], path: Path) -> None:
+    n, k = facts["n_gaussians"], (facts["sh_degree"] + 1) ** 2
+    expected = {
+        "neutral.sh": (avatar.neutral.sh, (n, k, 3)),
+        "deltas.sh": (avatar.deltas.sh, (len(avatar.blendshape_names), n, k, 3)),
+        "skin_weights": (avatar.skin_weights, (n, len(avatar.parents))),
+        "pose_basis": (avatar.pose_basis, (len(avatar.pose_features), n, 3)),
+    }
+    for name, (tensor, shape) in expected.items():
+        if tuple(tensor.shape) != shape:
+            raise InputError(
+                f"{path}: {name} has shape {tuple(tensor.shape)}, expected {shape}", "train the avatar anew"
+            )
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
