@@ -2,7 +2,8 @@
 
 A stylizer looks at a clip once (``prepare``) and is then a pure function of each chunk of frames (``apply``), so
 that any worker can do any chunk and killed runs resume with identical frames. Steadiness in time therefore comes
-from anchoring (landmarks, a prepared palette, fixed noise in head coordinates), never from state between frames.
+from anchoring (landmarks, a prepared palette, fixed noise), never from state between frames. ``run`` does around
+it what is common to all styles: it calms sensor noise, warps the face, and blends by strength.
 """
 
 from __future__ import annotations
@@ -18,19 +19,26 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float, UInt8
 
+    from toonifygb.stylize.anchors import Faces
+    from toonifygb.stylize.exaggerate import Exaggeration
+
 
 class Stylizer(Protocol):
     """One style.
 
-    Images are uint8 RGB ``(t, h, w, 3)``; landmarks are px ``(t, 478, 2)``, NaN where no face was found; mattes
-    are person mattes ``(t, h, w)`` in 0..1.
+    Images are uint8 RGB; ``faces`` holds one steadied set of landmarks per frame and how far it is to be trusted
+    (``presence``); mattes are person mattes in 0..1.
     """
 
     name: str
     description: str
     """One line for ``--help``."""
+    exaggeration: Exaggeration
+    """Caricature applied to frames, landmarks and mattes before ``apply`` sees them."""
+    denoise: bool
+    """Whether frames are calmed in time before ``apply`` sees them."""
 
-    def prepare(self, samples: UInt8[np.ndarray, "s h w 3"], landmarks: Float[np.ndarray, "s 478 2"]) -> Any:
+    def prepare(self, samples: UInt8[np.ndarray, "s h w 3"], faces: Faces) -> dict[str, Any]:
         """Whatever the whole clip shares (palette, exposure, scale), from frames sampled over it.
 
         The result is a plain dict of numbers and numpy arrays: it is stored with the run.
@@ -40,9 +48,9 @@ class Stylizer(Protocol):
     def apply(
         self,
         frames: UInt8[np.ndarray, "t h w 3"],
-        landmarks: Float[np.ndarray, "t 478 2"],
+        faces: Faces,
         mattes: Float[np.ndarray, "t h w"] | None,
-        state: Any,
+        state: dict[str, Any],
     ) -> UInt8[np.ndarray, "t h w 3"]:
         """The frames in this style, same size and count; independent of what was applied before."""
         ...

@@ -1,0 +1,208 @@
+"""What the drawn styles know of the face: steadied landmarks, its size, and soft masks that ride on them.
+
+Landmark numbers are MediaPipe's 478-point scheme; "left" and "right" are the subject's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from toonifygb.stylize.filters import blur
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+    from toonifygb.structures import Landmarks
+
+    Points = Float[np.ndarray, "n 2"]
+    Plane = Float[np.ndarray, "h w"]
+
+N_POINTS = 478
+OVAL = (10, 338, 297, 332, 284, 251, 389, 356, 454, 323, 361, 288, 397, 365, 379, 378, 400, 377, 152, 148, 176, 149)
+OVAL += (150, 136, 172, 58, 132, 93, 234, 127, 162, 21, 54, 103, 67, 109)
+LIPS = (61, 146, 91, 181, 84, 17, 314, 405, 321, 375, 291, 409, 270, 269, 267, 0, 37, 39, 40, 185)
+MOUTH = (78, 95, 88, 178, 87, 14, 317, 402, 318, 324, 308, 415, 310, 311, 312, 13, 82, 81, 80, 191)
+CHEEKS = (50, 280)
+JAW_LINE = (132, 58, 172, 136, 150, 149, 176, 148, 152, 377, 400, 378, 379, 365, 397, 288, 361)
+NOSE_BASE = (129, 98, 97, 2, 326, 327, 358)
+"""Below the nostrils, from wing to wing."""
+
+
+@dataclass(frozen=True)
+class Eye:
+    """Landmark numbers of one eye, lids from the outer to the inner corner."""
+
+    upper: tuple[int, ...]
+    lower: tuple[int, ...]
+    iris: int
+    rim: tuple[int, ...]
+    brow: tuple[int, ...]
+
+
+EYES = (
+    Eye(
+        upper=(33, 246, 161, 160, 159, 158, 157, 173, 133),
+        lower=(33, 7, 163, 144, 145, 153, 154, 155, 133),
+        iris=468,
+        rim=(469, 470, 471, 472),
+        brow=(70, 63, 105, 66, 107, 55, 65, 52, 53, 46),
+    ),
+    Eye(
+        upper=(263, 466, 388, 387, 386, 385, 384, 398, 362),
+        lower=(263, 249, 390, 373, 374, 380, 381, 382, 362),
+        iris=473,
+        rim=(474, 475, 476, 477),
+        brow=(300, 293, 334, 296, 336, 285, 295, 282, 283, 276),
+    ),
+)
+FADE_FRAMES = 6
+"""Frames over which face-bound effects come and go beside a span in which the face was not found."""
+
+
+@dataclass(frozen=True)
+class Faces:
+    """The followed face through (part of) a clip, as the styles see it."""
+
+    points: Float[np.ndarray, "t 478 2"]
+    """px; steadied in time and bridged over frames without a face, so always finite."""
+    presence: Float[np.ndarray, " t"]
+    """0..1: how far face-bound effects apply; 0 without a face, fading beside such spans."""
+
+    def __len__(self) -> int:
+        return len(self.presence)
+
+    def __getitem__(self, frames: slice | list[int]) -> Faces:
+        return Faces(self.points[frames], self.presence[frames])
+
+
+def no_faces(n_frames: int) -> Faces:
+    """``n_frames`` frames in which no face was found."""
+    return Faces(np.zeros((n_frames, N_POINTS, 2), np.float32), np.zeros(n_frames, np.float32))
+
+
+def follow(landmarks: Landmarks) -> Faces:
+    """Landmarks of a whole clip made fit to anchor drawing: bridged, steadied, with presence."""
+    points = landmarks.points.detach().cpu().numpy().astype(np.float64)
+    valid = np.asarray(np.isfinite(points).all((1, 2)))
+    if not valid.any():
+        return no_faces(len(points))
+    points = _steady(_bridge(points, valid))
+    return Faces(points.astype(np.float32), _presence(valid))
+
+
+def _bridge(points: Float[np.ndarray, "t n 2"], valid: Bool[np.ndarray, " t"]) -> Float[np.ndarray, "t n 2"]:
+    """Missing frames filled by straight motion between the neighbours found."""
+    found = np.flatnonzero(valid)
+    frames = np.arange(len(points))
+    after = found[np.minimum(np.searchsorted(found, frames), len(found) - 1)]
+    before = found[np.maximum(np.searchsorted(found, frames, side="right") - 1, 0)]
+    share = (frames - before) / np.maximum(after - before, 1)
+    return points[before] + (points[after] - points[before]) * share[:, None, None]
+
+
+def _steady(points: Float[np.ndarray, "t n 2"], window: int = 4, sigma_frames: float = 2.0) -> np.ndarray:
+    """Jitter removed by a symmetric window that lets real motion pass.
+
+    A bilateral mean over time: neighbours count less the further they are in time and the further the landmark has
+    moved, with 1.2 % of the face width as the size of jitter. So still faces hold still and blinks stay quick.
+    """
+    reach = 0.012 * np.median(face_widths(points))
+    total, weights = points.copy(), np.ones(points.shape[:2])
+    for shift in range(1, min(window, len(points) - 1) + 1):
+        near = float(np.exp(-0.5 * (shift / sigma_frames) ** 2))
+        step = points[shift:] - points[:-shift]
+        weight = near * np.exp(-0.5 * (step**2).sum(-1) / max(reach, 1e-6) ** 2)
+        total[:-shift] += weight[..., None] * points[shift:]
+        total[shift:] += weight[..., None] * points[:-shift]
+        weights[:-shift] += weight
+        weights[shift:] += weight
+    return total / weights[..., None]
+
+
+def _presence(valid: Bool[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
+    lost = np.flatnonzero(~valid)
+    if len(lost) == 0:
+        return np.ones(len(valid), np.float32)
+    distance = np.abs(np.arange(len(valid))[:, None] - lost[None]).min(1)
+    share = np.minimum(distance / FADE_FRAMES, 1.0)
+    return (share * share * (3.0 - 2.0 * share)).astype(np.float32)
+
+
+def face_widths(points: Float[np.ndarray, "t 478 2"]) -> Float[np.ndarray, " t"]:
+    """Width in px the face would have seen from the front: from the area of its outline, which turning the head
+    changes least.
+    """
+    outline = points[:, OVAL]
+    following = np.roll(outline, -1, axis=1)
+    cross = outline[..., 0] * following[..., 1] - outline[..., 1] * following[..., 0]
+    area = 0.5 * np.abs(cross.sum(1))
+    return np.sqrt(area * 0.9)
+
+
+def mask(shape: tuple[int, int], polygons: list[Points], feather_px: float) -> Plane:
+    """Soft mask of polygons given in px: drawn with sub-pixel corners, then feathered."""
+    plane = np.zeros(shape, np.uint8)
+    for polygon in polygons:
+        fill(plane, polygon)
+    return blur(plane.astype(np.float32) * np.float32(1 / 255), feather_px)
+
+
+def fill(plane: np.ndarray, polygon: Points, shift: int = 4) -> None:
+    """Draws a filled anti-aliased polygon given in continuous px into a uint8 plane."""
+    corners = np.rint((polygon - 0.5) * (1 << shift)).astype(np.int32)  # cv2 counts from pixel centres
+    cv2.fillPoly(plane, [corners], 255, cv2.LINE_AA, shift)
+
+
+def ribbon(shape: tuple[int, int], line: Points, width_px: float, feather_px: float) -> Plane:
+    """Soft mask along an open line given in px."""
+    plane = np.zeros(shape, np.uint8)
+    corners = np.rint((line - 0.5) * 16).astype(np.int32)
+    cv2.polylines(plane, [corners], False, 255, max(1, round(width_px)), cv2.LINE_AA, 4)
+    return blur(plane.astype(np.float32) * np.float32(1 / 255), feather_px)
+
+
+def outline_of_eye(points: Points, eye: Eye) -> Points:
+    """Closed outline of the eye opening."""
+    return np.concatenate([points[list(eye.upper)], points[list(eye.lower[-2:0:-1])]])
+
+
+def spot(shape: tuple[int, int], centre: Points, radius_px: float) -> Plane:
+    """A round bump, 1 at the centre and gone at about twice the radius."""
+    y = np.exp(-0.5 * ((np.arange(shape[0], dtype=np.float32) + 0.5 - centre[1]) / radius_px) ** 2)
+    x = np.exp(-0.5 * ((np.arange(shape[1], dtype=np.float32) + 0.5 - centre[0]) / radius_px) ** 2)
+    return (y[:, None] * x[None]).astype(np.float32)
+
+
+def face_mask(shape: tuple[int, int], points: Points, feather_px: float) -> Plane:
+    """Soft mask of the face outline, from hair line to chin."""
+    return mask(shape, [points[list(OVAL)]], feather_px)
+
+
+NO_FACE_UNIT = 0.35
+"""Assumed face width in a clip without faces, in shorter sides of the picture."""
+
+
+def face_unit(samples: np.ndarray, faces: Faces) -> float:
+    """Face width in px that radii and line widths of the clip follow; one number, so lines never breathe."""
+    seen = faces.presence > 0
+    if not seen.any():
+        return NO_FACE_UNIT * min(samples.shape[1:3])
+    return max(float(np.median(face_widths(faces.points[seen]))), 4.0)
+
+
+def skin_pixels(labs: list[np.ndarray], faces: Faces) -> Float[np.ndarray, "n 3"]:
+    """Lab colours of the face without eyes and mouth, every third pixel; empty when no face was sampled."""
+    found = [np.zeros((0, 3), np.float32)]
+    for lab, points, presence in zip(labs, faces.points, faces.presence, strict=True):
+        if presence == 0:
+            continue
+        shape = lab.shape[:2]
+        holes = [outline_of_eye(points, eye) for eye in EYES] + [points[list(LIPS)]]
+        holes += [points[list(eye.brow)] for eye in EYES]
+        inside = mask(shape, [points[list(OVAL)]], 0.0) * (1.0 - mask(shape, holes, 0.0))
+        found.append(lab[inside > 0.5][::3])
+    return np.concatenate(found)

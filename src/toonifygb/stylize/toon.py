@@ -1,0 +1,128 @@
+"""The style ``toon``: cel shading in soft bands, coloured ink lines, large bright eyes.
+
+Everything that decides where a band or a line lies (levels, skin colour, line width) is fixed once per clip by
+``prepare``; a frame only supplies the picture. Fields are simplified at a working size in which the face is about
+``WORK_FACE_PX`` wide, enlarged, and only then thresholded, so edges are crisp at any size of frame.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from toonifygb.stylize import features, filters
+from toonifygb.stylize.anchors import JAW_LINE, NOSE_BASE, face_mask, face_unit, ribbon, skin_pixels
+from toonifygb.stylize.exaggerate import Exaggeration
+from toonifygb.stylize.filters import blur, mix, smoothstep
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, UInt8
+
+    from toonifygb.stylize.anchors import Faces
+
+    Frames = UInt8[np.ndarray, "t h w 3"]
+    Frame = UInt8[np.ndarray, "h w 3"]
+    Plane = Float[np.ndarray, "h w"]
+    Lab = Float[np.ndarray, "h w 3"]
+    Points = Float[np.ndarray, "478 2"]
+
+WORK_FACE_PX = 180
+"""Width of the face at which regions are simplified; more shows pores, less loses nostrils."""
+INK = np.array([0.17, 0.09, 0.13], np.float32)
+"""sRGB of the lines: a warm near-black, which sits better on skin than pure black."""
+SKIN_SPREAD = 11.0
+"""Distance in Lab a, b at which a colour stops being skin."""
+
+
+class Toon:
+    """Cel shading: bands of colour, ink lines, enlarged eyes."""
+
+    name = "toon"
+    description = "cel shading with ink lines and large bright eyes"
+    exaggeration = Exaggeration(eye_gain=1.3, chin=0.025)
+    denoise = True
+
+    def prepare(self, samples: Frames, faces: Faces) -> dict[str, Any]:
+        """Bands from the clip's own tones, its skin colour, and the width of its face."""
+        unit = face_unit(samples, faces)
+        labs = [filters.to_lab(frame) for frame in samples]
+        tones = np.concatenate([blur(lab[..., 0], 0.02 * unit)[::4, ::4].ravel() for lab in labs])
+        skin = skin_pixels(labs, faces)
+        skin_tones = skin[:, 0] if len(skin) else tones
+        return {
+            "unit": unit,
+            "has_skin": bool(len(skin)),
+            "skin": [float(value) for value in (np.median(skin, axis=0) if len(skin) else np.zeros(3))],
+            "tone_curve": filters.band_curve(filters.cluster_levels(tones, 6), softness=1.6, remain=0.35),
+            "skin_curve": filters.band_curve(filters.cluster_levels(skin_tones, 4), softness=1.2, remain=0.25),
+        }
+
+    def apply(self, frames: Frames, faces: Faces, mattes: Any, state: dict[str, Any]) -> Frames:
+        """The frames drawn as cels."""
+        drawn = [
+            self._draw(frame, points, float(presence), state)
+            for frame, points, presence in zip(frames, faces.points, faces.presence, strict=True)
+        ]
+        return np.stack(drawn)
+
+    def _draw(self, frame: Frame, points: Points, presence: float, state: dict[str, Any]) -> Frame:
+        height, width = frame.shape[:2]
+        scale = min(1.0, WORK_FACE_PX / state["unit"])
+        size = (max(1, round(width * scale)), max(1, round(height * scale)))
+        lab = filters.to_lab(filters.resize(frame, *size))
+        fields = _simplified(lab, points * scale, presence, state, state["unit"] * scale)
+        fields = filters.resize(fields, width, height)
+        painted = _shaded(fields, state)
+        if presence > 0:
+            features.draw_toon_features(painted, frame, points, presence, state["unit"])
+        line = smoothstep(1.5, 3.6, fields[..., 4])
+        rgb = filters.to_rgb(painted)
+        rgb = mix(rgb, INK + 0.12 * rgb, 0.92 * line)
+        if presence > 0:
+            features.draw_lashes(rgb, points, presence, state["unit"], INK)
+        return filters.to_bytes(rgb)
+
+
+def _simplified(lab: Lab, points: Points, presence: float, state: dict[str, Any], unit: float) -> np.ndarray:
+    """What shading and lines need, at working size: L, a, b, share of skin, ink response."""
+    tangents, clarity = filters.structure(lab, 0.012 * unit)
+    simple = filters.kuwahara(lab, tangents, clarity, 0.03 * unit)
+    fine = lab - simple
+    amount = np.sqrt(filters.dot(fine, fine))
+    simple += fine * smoothstep(10.0, 22.0, blur(amount, 0.006 * unit))[..., None]
+    skin = np.zeros(lab.shape[:2], np.float32)
+    if state["has_skin"]:
+        colour = blur(simple, 0.02 * unit)
+        difference = colour[..., 1:] - np.float32(state["skin"][1:])
+        away = filters.dot(difference, difference)
+        lit = smoothstep(0.35 * state["skin"][0], 0.6 * state["skin"][0], colour[..., 0])
+        skin = np.exp(-0.5 * away / np.float32(SKIN_SPREAD**2)) * lit
+        inside = face_mask(lab.shape[:2], points, 0.03 * unit) * np.float32(presence)
+        skin *= 0.5 + 0.5 * inside
+        simple[..., 0] = mix(simple[..., 0], blur(simple[..., 0], 0.02 * unit), inside * skin)
+        simple[..., 1:] = mix(simple[..., 1:], blur(simple[..., 1:], 0.06 * unit), 0.7 * inside * skin)
+    response = filters.ink_response(mix(simple[..., 0], lab[..., 0], 0.75), tangents, 0.008 * unit)
+    if presence > 0:
+        response *= 1.0 + np.float32(presence) * _anatomy(lab.shape[:2], points, unit)
+    return np.dstack([simple, skin, response])
+
+
+def _anatomy(shape: tuple[int, int], points: Points, unit: float) -> Plane:
+    """Where a draughtsman looks for lines even if the picture shows them faintly: jaw and nose; 0..1.5."""
+    jaw = ribbon(shape, points[list(JAW_LINE)], 0.05 * unit, 0.02 * unit)
+    nose = ribbon(shape, points[list(NOSE_BASE)], 0.05 * unit, 0.02 * unit)
+    return 1.5 * np.maximum(jaw, nose)
+
+
+def _shaded(fields: np.ndarray, state: dict[str, Any]) -> Lab:
+    """Fields to Lab colour: tones gathered into bands, richer chroma, shadows leaning to violet."""
+    tone, skin = fields[..., 0], fields[..., 3]
+    banded = mix(
+        filters.curve_lookup(tone, state["tone_curve"]), filters.curve_lookup(tone, state["skin_curve"]), skin
+    )
+    shade = smoothstep(2.0, 24.0, np.float32(state["skin"][0]) - banded) * skin
+    a = fields[..., 1] * (1.22 - 0.05 * skin) + 5.0 * shade
+    b = fields[..., 2] * (1.22 - 0.05 * skin) - 3.0 * shade
+    lifted = banded + 4.0 * skin * (1.0 - banded / 100.0) * 2.0
+    return np.dstack([lifted, a, b]).astype(np.float32)
