@@ -2,13 +2,17 @@
 
 Coverage is exact. Vertices snap to 1/4096 px, and whether a pixel centre lies in a triangle is decided in integers
 with the top-left rule, so neighbouring faces neither overlap nor leave a gap, and the answer does not depend on the
-machine. The nearest face wins, the first of equally near ones; both sides of a face are drawn. Nothing here is
-differentiable in the vertices; ``interpolate`` is differentiable in the attributes.
+machine or on the number of threads. The nearest face wins, the first of equally near ones; both sides of a face are
+drawn. Nothing here is differentiable in the vertices; ``interpolate`` is differentiable in the attributes.
+
+``_rasterize_reference`` is the definition in numpy; ``native/src/mesh.cpp`` is its fast twin.
 """
 
 from __future__ import annotations
 
+import ctypes
 import itertools
+import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from toonifygb.render import _resolve, library
 from toonifygb.structures import Camera, Rendering, TensorRecord
 
 if TYPE_CHECKING:
@@ -64,6 +69,8 @@ def rasterize_mesh(
     camera: Camera,
     *,
     near: float = NEAR_M,
+    backend: str = "auto",
+    threads: int | None = None,
 ) -> MeshHits:
     """Nearest face, barycentric weights and depth at every pixel centre.
 
@@ -72,11 +79,22 @@ def rasterize_mesh(
         faces: corner indices; either winding.
         camera: pinhole camera.
         near: faces are clipped where they come nearer to the camera plane than this, m.
+        backend: ``native``, ``reference`` or ``auto`` (native where the library is built).
+        threads: threads of the native rasteriser, all processors when ``None``; the result does not depend on it.
+
+    Raises:
+        InputError: no such backend.
+        BackendError: ``native`` was asked for and is not available.
     """
     points = _homogeneous_pixels(vertices, camera)
     corners = np.ascontiguousarray(faces.detach().cpu().numpy(), np.int64)
     screen, source, corner_bary = _to_screen(points, corners, near)
-    triangle, bary, depth = _rasterize_reference(screen, camera.width, camera.height)
+    if _resolve(backend) == "native":
+        triangle, bary, depth = _rasterize_native(
+            screen, camera.width, camera.height, threads or os.cpu_count() or 1
+        )
+    else:
+        triangle, bary, depth = _rasterize_reference(screen, camera.width, camera.height)
     if source is not None:
         triangle, bary = _undo_clipping(triangle, bary, source, corner_bary)
     return MeshHits(torch.from_numpy(triangle), torch.from_numpy(bary), torch.from_numpy(depth)).to(vertices.device)
@@ -259,6 +277,30 @@ def _undo_clipping(
     bary[on_cut] = np.einsum("nk,nkc->nc", bary[on_cut], cut_bary[triangle[on_cut] - first_cut])
     face_id = np.where(triangle >= 0, np.append(source, -1)[triangle], -1)
     return face_id, bary
+
+
+# --- the native twin --------------------------------------------------------------------------------------------
+
+
+def _rasterize_native(
+    screen: _Screen, width: int, height: int, threads: int
+) -> tuple[Int64[np.ndarray, "h w"], np.ndarray, np.ndarray]:
+    """Triangle number, weights and depth at each pixel centre, by the library."""
+    rasterize = library.load().tgb_mesh_rasterize
+    address, size = ctypes.c_void_p, ctypes.c_int64
+    rasterize.argtypes = [address] * 3 + [size] + [ctypes.c_int] * 3 + [address] * 3
+    rasterize.restype = None
+    triangle = np.empty((height, width), np.int64)
+    bary = np.empty((height, width, 3), np.float32)
+    depth = np.empty((height, width), np.float32)
+    inputs = [np.ascontiguousarray(array) for array in (screen.xy, screen.inverse_depth, screen.faces)]
+    rasterize(
+        *(array.ctypes.data for array in inputs),
+        len(screen.faces),
+        *(width, height, threads),
+        *(array.ctypes.data for array in (triangle, bary, depth)),
+    )
+    return triangle, bary, depth
 
 
 # --- the definition ---------------------------------------------------------------------------------------------
