@@ -1,0 +1,199 @@
+"""A video file as FFmpeg sees it: what it promises, what it holds, and its frames up to the first damage."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import av
+import numpy as np
+from av.error import FFmpegError
+from av.stream import Disposition
+
+from toonifygb.errors import InputError
+from toonifygb.structures import VideoInfo
+from toonifygb.video.pixels import PictureFormat
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from av import VideoFrame
+    from av.container import InputContainer
+    from av.video.stream import VideoStream
+    from jaxtyping import UInt8
+
+_FALLBACK_FPS = 25.0
+_NOT_VIDEO = ("tty", "subviewer", "srt", "ass")
+"""FFmpeg renders plain text as if it were a clip; nobody means that here."""
+_MAX_PIXEL_STRETCH = 0.15
+"""Pixels farther from square than this are brought to square, for the geometry of a face depends on it. Nearer
+ones (all of 4:3 television, and clips resized without care) are kept as stored: resampling would cost more."""
+_MAX_BAD_STARTS = 200
+"""Pictures skipped at the start while the decoder waits for a complete one, as in a recording cut out of a
+broadcast."""
+
+
+class VideoFile:
+    """One video file; opened anew for every pass over it.
+
+    Raises:
+        InputError: not a file that holds a decodable picture.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        with opened(path) as (container, stream):
+            timing = _scan(container, stream)
+            has_audio = bool(container.streams.audio)
+            opaque_only = stream.metadata.get("alpha_mode") == "1"
+        with opened(path) as (container, stream):
+            first = next(_pictures(container, stream, lambda _: None), None)
+            if first is None:
+                raise InputError(f"{path} contains no picture that can be decoded", "convert or re-export the clip")
+            aspect = float(stream.sample_aspect_ratio or 1)
+            stretched = abs(aspect - 1) > _MAX_PIXEL_STRETCH
+            self._format = PictureFormat.of(first, aspect if stretched else 1.0)
+            interlaced = first.interlaced_frame
+        width, height = self._format.upright_size
+        findings = list(timing.findings)
+        if aspect != 1.0:
+            done = f"stretched to {width}x{height} px" if stretched else "kept as they are"
+            findings.append(f"has pixels {aspect:.3g} times as wide as high; {done}")
+        if interlaced:
+            findings.append("is interlaced; moving edges show a comb")
+        if opaque_only:
+            findings.append("has an alpha channel that is not used")
+        self.info = VideoInfo(
+            path=str(path),
+            width=width,
+            height=height,
+            fps=timing.fps,
+            n_frames=timing.n_frames,
+            has_audio=has_audio,
+            problems=tuple(f"{path} {finding}" for finding in findings),
+        )
+
+    def frames(self, note: Callable[[str], None]) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+        """Upright RGB frames up to the end or the first damage, which is noted."""
+        with opened(self._path) as (container, stream):
+            for picture in _pictures(container, stream, note):
+                yield self._format.to_rgb(picture, note)
+
+    def count(self) -> int:
+        """Number of frames that can be decoded."""
+        with opened(self._path) as (container, stream):
+            return sum(1 for _ in _pictures(container, stream, lambda _: None))
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
+    """The container and its main video stream, closed afterwards.
+
+    Raises:
+        InputError: unreadable, no video, or no decoder for it.
+    """
+    hint = "give a video file such as .mp4, .mov, .webm or .gif"
+    try:
+        # "file:" keeps a colon in the name from being taken for a protocol; playlists must not reach the network.
+        container = av.open(f"file:{path}", options={"protocol_whitelist": "file"})
+    except OSError as error:
+        raise InputError(f"{path} cannot be opened: {error.strerror}", hint) from error
+    except FFmpegError as error:
+        raise InputError(f"{path} is not a video that can be read, or its start is missing", hint) from error
+    with container:
+        streams = [stream for stream in container.streams.video if not _is_cover(stream)]
+        if not streams or container.format.name in _NOT_VIDEO:
+            raise InputError(f"{path} contains no video", hint)
+        stream = streams[0]
+        if stream.codec_context is None:
+            raise InputError(f"{path} is encoded in a way that cannot be decoded here", "convert it to H.264")
+        stream.thread_type = "AUTO"
+        yield container, stream
+
+
+def _is_cover(stream: VideoStream) -> bool:
+    """Whether a stream is the cover picture of a sound file."""
+    return bool(stream.disposition & Disposition.attached_pic)
+
+
+@dataclass(frozen=True)
+class _Timing:
+    """What the packets tell without being decoded."""
+
+    fps: float
+    n_frames: int | None
+    findings: tuple[str, ...]
+
+
+def _scan(container: InputContainer, stream: VideoStream) -> _Timing:
+    """Reads all packets of the stream (no decoding) for their number and spacing."""
+    times: list[int] = []
+    n_packets = 0
+    try:
+        for packet in container.demux(stream):
+            if packet.size and not packet.is_discard:
+                n_packets += 1
+                if packet.pts is not None:
+                    times.append(packet.pts)
+    except FFmpegError:
+        pass  # the decoding pass meets the same damage and notes it
+    n_frames = n_packets or None
+    declared = float(stream.average_rate or stream.guessed_rate or 0)
+    if len(times) < n_packets or len(times) < 2 or stream.time_base is None:
+        if declared:
+            return _Timing(declared, n_frames, ())
+        finding = f"does not tell its pace; taken as {_FALLBACK_FPS:g} frames per second"
+        return _Timing(_FALLBACK_FPS, n_frames, (finding,))
+    seconds = np.sort(np.array(times, np.float64)) * float(stream.time_base)
+    steps = np.diff(seconds)
+    measured = len(steps) / max(seconds[-1] - seconds[0], 1e-9)
+    # The declared rate is exact where it agrees; time stamps are rounded.
+    fps = declared if abs(declared - measured) < 0.002 * measured else measured
+    typical = float(np.median(steps))
+    if (np.abs(steps - typical) > 0.5 * typical).any():
+        finding = f"has a variable frame rate; its frames are kept as they are, at {fps:.4g} per second on average"
+        return _Timing(fps, n_frames, (finding,))
+    return _Timing(fps, n_frames, ())
+
+
+def _pictures(container: InputContainer, stream: VideoStream, note: Callable[[str], None]) -> Iterator[VideoFrame]:
+    """Decoded pictures in order of showing, up to the first damage."""
+    n_good, n_bad = 0, 0
+    source = container.decode(stream)
+    while True:
+        try:
+            picture = next(source, None)
+        except FFmpegError:
+            n_bad += 1
+            if n_good == 0 and n_bad <= _MAX_BAD_STARTS:
+                source = container.decode(stream)
+                continue
+            n_drained = 0
+            for picture in _drain(stream):
+                n_drained += 1
+                yield picture
+            note(f"is damaged after frame {n_good + n_drained}; only the frames before that are used")
+            return
+        if picture is None:
+            break
+        if picture.is_corrupt and n_good:
+            note(f"is damaged after frame {n_good}; only the frames before that are used")
+            return
+        if not picture.is_corrupt:
+            n_good += 1
+            yield picture
+    if n_good < stream.frames:
+        note(f"ends early: it promises {stream.frames} frames and holds {n_good}")
+
+
+def _drain(stream: VideoStream) -> Iterator[VideoFrame]:
+    """Good pictures the decoder still holds back for reordering when the stream breaks off."""
+    try:
+        for picture in stream.decode(None):
+            if picture.is_corrupt:
+                return
+            yield picture
+    except FFmpegError:
+        return

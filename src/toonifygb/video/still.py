@@ -1,0 +1,69 @@
+"""Single images: files in, files out, and JPEG bytes for reports."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from toonifygb.errors import InputError
+from toonifygb.video.pixels import flatten_alpha
+
+if TYPE_CHECKING:
+    from jaxtyping import UInt8
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+_ALPHA_STEPS = {"uint8": 1, "uint16": 257}
+"""By what the alpha of each depth is divided to become 0..255."""
+
+
+def load_image(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
+    """An image file as upright 8-bit RGB: EXIF rotation applied, grey repeated, 16 bits cut to 8, alpha on black.
+
+    Raises:
+        InputError: no such file, or not an image.
+    """
+    path = Path(path)
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise InputError(f"image {path} cannot be read: {error.strerror}", "check the path") from error
+    # Bytes are decoded rather than the path, which OpenCV cannot open on Windows when it is not ASCII.
+    stored = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    # Decoded twice because only the second mode applies the EXIF rotation and brings every depth to 8 bits, and
+    # only the first keeps alpha.
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if stored is not None else None
+    if stored is None or image is None:
+        raise InputError(f"{path} is not an image that can be read", f"use one of {', '.join(IMAGE_SUFFIXES)}")
+    step = _ALPHA_STEPS.get(stored.dtype.name)
+    if step and stored.ndim == 3 and stored.shape[2] == 4:
+        alpha = (stored[..., 3:] // step).astype(np.uint8)
+        rgba = np.concatenate((cv2.cvtColor(image, cv2.COLOR_BGR2RGB), alpha), axis=2)
+        return flatten_alpha(rgba)[0]
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def save_png(path: str | os.PathLike[str], image: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Writes an RGB image as PNG; the file appears only when it is complete.
+
+    Raises:
+        InputError: the place cannot be written to.
+    """
+    path = Path(path)
+    _, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    part = path.with_name(f"{path.stem}.part{path.suffix}")
+    try:
+        part.write_bytes(data.tobytes())
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise InputError(f"image {path} cannot be written: {error.strerror}", "choose another place") from error
+
+
+def encode_jpeg(image: UInt8[np.ndarray, "h w 3"], quality: int = 85) -> bytes:
+    """An RGB image as JPEG bytes; ``quality`` 0..100."""
+    _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return data.tobytes()

@@ -1,0 +1,189 @@
+"""Clips out: H.264 in MP4, as every browser and phone plays it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import av
+import numpy as np
+from av import VideoFrame
+from av.error import FFmpegError
+from av.video.reformatter import ColorRange, Colorspace, Interpolation
+
+from toonifygb.errors import InputError
+from toonifygb.video.sound import open_sound
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from types import TracebackType
+
+    from av.video.stream import VideoStream
+    from jaxtyping import UInt8
+
+_QUALITY = "17"
+"""x264's constant rate factor: visually lossless, since a written clip may be read again for training."""
+_LOOKAHEAD_BYTES = 256 * 2**20
+"""Most memory x264 may hold in frames to look ahead; only clips beyond 1440p feel it."""
+_BT709, _LIMITED = 1, 1
+"""H.273's number for BT.709 (primaries, transfer and matrix), and FFmpeg's for studio range."""
+_ROUNDING = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INP
+
+
+class Writer:
+    """Writes frames at a constant pace; the file appears under its name only when it is complete.
+
+    Use as a context manager. An exception inside, also Ctrl-C, leaves nothing behind. H.264 as players need it
+    (4:2:0) has even sides only: an odd side grows by one row or column, repeated from the last, so
+    ``written_size`` may exceed the frames' size by one.
+
+    Args:
+        path: the file to write, ending in ``.mp4``; an existing one is replaced at the end.
+        width: of the frames, px.
+        height: of the frames, px.
+        fps: frames per second.
+        audio_from: clip whose sound accompanies the frames, from its start and cut to their length; a clip
+            without sound gives none.
+
+    Raises:
+        InputError: the place cannot be written to, or the disk is full.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        width: int,
+        height: int,
+        fps: float | Fraction,
+        *,
+        audio_from: str | os.PathLike[str] | None = None,
+    ) -> None:
+        self.path = Path(path)
+        self.written_size = (width + width % 2, height + height % 2)
+        self.n_frames = 0
+        self._size = (width, height)
+        self._rate = exact_rate(fps)
+        self._part = self.path.with_name(f"{self.path.stem}.part.mp4")
+        if self.path.suffix.lower() != ".mp4":
+            raise InputError(
+                f"output {self.path} does not end in .mp4", f"write to {self.path.with_suffix('.mp4')}"
+            )
+        with self._explained():
+            # The whole index in front lets players start before the file has arrived.
+            self._container = av.open(f"file:{self._part}", "w", format="mp4", options={"movflags": "+faststart"})
+        try:
+            self._stream = self._add_video()
+            self._sound = None if audio_from is None else open_sound(audio_from, self._container)
+        except BaseException:
+            self._discard()
+            raise
+
+    def write(self, frame: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Appends one RGB frame.
+
+        Raises:
+            InputError: the disk is full or went away.
+        """
+        width, height = self._size
+        assert frame.shape == (height, width, 3) and frame.dtype == np.uint8, (
+            f"frame is {frame.shape} {frame.dtype}"
+        )
+        picture = VideoFrame.from_ndarray(_padded_to_even(frame), format="rgb24").reformat(
+            format="yuv420p",
+            dst_colorspace=Colorspace.ITU709,
+            src_color_range=ColorRange.JPEG,
+            dst_color_range=ColorRange.MPEG,
+            interpolation=_ROUNDING,
+        )
+        picture.pts, picture.time_base = self.n_frames, 1 / self._rate
+        with self._explained():
+            self._container.mux(self._stream.encode(picture))
+            self.n_frames += 1
+            if self._sound is not None:
+                self._sound.advance(self.n_frames / self._rate)
+
+    def close(self) -> None:
+        """Completes the file and gives it its name; without frames nothing is left behind.
+
+        Raises:
+            InputError: the disk is full or went away.
+        """
+        try:
+            if self.n_frames:
+                with self._explained():
+                    self._container.mux(self._stream.encode(None))
+                    if self._sound is not None:
+                        self._sound.finish()
+                    self._container.close()
+                    os.replace(self._part, self.path)
+        finally:
+            self._discard()
+
+    def __enter__(self) -> Writer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self._discard()
+
+    def _add_video(self) -> VideoStream:
+        width, height = self.written_size
+        frame_bytes = width * height * 3 // 2
+        options = {
+            "crf": _QUALITY,
+            "preset": "medium",
+            "rc-lookahead": str(max(4, min(40, _LOOKAHEAD_BYTES // frame_bytes))),
+        }
+        stream = self._container.add_stream("libx264", rate=self._rate, options=options)
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        context = stream.codec_context
+        context.time_base = 1 / self._rate
+        context.color_primaries = context.color_trc = context.colorspace = _BT709
+        context.color_range = _LIMITED
+        return stream
+
+    def _discard(self) -> None:
+        """Removes whatever is unfinished; safe to call at any time, any number of times."""
+        sound = getattr(self, "_sound", None)
+        if sound is not None:
+            sound.close()
+        # Closing writes the index; on a full disk that fails again, which is no news.
+        with contextlib.suppress(FFmpegError, OSError):
+            self._container.close()
+        self._part.unlink(missing_ok=True)
+
+    @contextlib.contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Turns the system's complaints about the output into one sentence."""
+        try:
+            yield
+        except (FFmpegError, OSError) as error:
+            reason = error.strerror or str(error)
+            raise InputError(
+                f"video {self.path} cannot be written: {reason}", "check the folder, its permissions and free space"
+            ) from error
+
+
+def exact_rate(fps: float | Fraction) -> Fraction:
+    """The pace as a fraction; 29.97 and its kin become multiples of 1000/1001, as they are meant."""
+    assert fps > 0, f"{fps} frames per second"
+    if isinstance(fps, Fraction):
+        return fps
+    television = Fraction(round(fps * 1001 / 1000) * 1000, 1001)
+    if television and abs(float(television) - fps) < 2e-3 and abs(round(fps) - fps) > 1e-6:
+        return television
+    return Fraction(fps).limit_denominator(1000)
+
+
+def _padded_to_even(frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+    height, width = frame.shape[:2]
+    if width % 2 or height % 2:
+        frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+    return np.ascontiguousarray(frame)
