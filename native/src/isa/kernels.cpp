@@ -1,0 +1,13 @@
+#include "kernels.h"
+
+namespace tgb {
+
+#define TGB_JOIN_(a, b) a##b
+#define TGB_JOIN(a, b) TGB_JOIN_(a, b)
+extern const Kernels TGB_JOIN(kernels_, TGB_ISA);
+const Kernels TGB_JOIN(kernels_, TGB_ISA) = {
+    TGB_ISA::kIsaName,           TGB_ISA::project_forward,  TGB_ISA::composite_forward,
+    TGB_ISA::composite_backward, TGB_ISA::project_backward,
+};
+
+}  // namespace tgb

@@ -1,0 +1,56 @@
+// A small vector layer: a vector F of kWidth floats and a mask M with the same operators for every instruction set,
+// so that kernels read like scalar code. Only what the kernels use.
+//
+// Everything compiled per instruction set stays in the namespace tgb::TGB_ISA and calls no function template of the
+// standard library: the linker would merge such code across instruction sets and could pick one the machine lacks.
+#pragma once
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+
+#if defined(__AVX512F__)
+#include "simd_avx512.h"
+#elif defined(__AVX2__)
+#include "simd_avx2.h"
+#else
+#include "simd_generic.h"
+#endif
+
+namespace tgb {
+namespace TGB_ISA {
+
+static inline F& operator+=(F& a, F b) { return a = a + b; }
+static inline F operator-(F a) { return F(0.f) - a; }
+static inline F clamp(F a, F lo, F hi) { return vmin(vmax(a, lo), hi); }
+static inline int imin(int a, int b) { return a < b ? a : b; }
+static inline int imax(int a, int b) { return a > b ? a : b; }
+
+// 2^x with a relative error below 3e-7 for x in [-126, 126]: 2^n times a degree-5 minimax polynomial of the rest.
+static inline F exp2(F x) {
+  F f;
+  const F n = exp2_split(x, f), f2 = f * f;
+  const F a = fma(F(0.0013264727252686875f), f, F(0.009671512785855915f));
+  const F b = fma(F(0.05550733744471606f), f, F(0.24022242083110573f));
+  const F c = fma(F(0.693146977597677f), f, F(1.f));
+  return scale_by_power(fma(fma(a, f2, b), f2, c), n);
+}
+
+// Array of structs of S floats, `count` <= kWidth items (the last one repeated), to S vectors.
+template <int S>
+static inline void load_structs(const float* p, int count, F* out) {
+  alignas(64) float t[S][kWidth];
+  for (int i = 0; i < kWidth; i++)
+    for (int s = 0; s < S; s++) t[s][i] = p[imin(i, count - 1) * S + s];
+  for (int s = 0; s < S; s++) out[s] = load(t[s]);
+}
+
+template <int S>
+static inline void store_structs(float* p, int count, const F* in) {
+  alignas(64) float t[S][kWidth];
+  for (int s = 0; s < S; s++) store(t[s], in[s]);
+  for (int i = 0; i < count; i++)
+    for (int s = 0; s < S; s++) p[i * S + s] = t[s][i];
+}
+
+}  // namespace TGB_ISA
+}  // namespace tgb

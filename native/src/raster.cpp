@@ -1,0 +1,91 @@
+// C interface of the rasteriser.
+#include "raster.h"
+
+#include <chrono>
+#include <mutex>
+#include <vector>
+
+#include "dispatch.h"
+#include "export.h"
+
+namespace {
+
+std::mutex frames_mutex;
+std::vector<tgb::Frame*> free_frames;  // kept for ever: their memory is the workspace of the next image
+
+tgb::Frame* take_frame() {
+  std::lock_guard<std::mutex> lock(frames_mutex);
+  if (free_frames.empty()) return new tgb::Frame;
+  tgb::Frame* frame = free_frames.back();
+  free_frames.pop_back();
+  return frame;
+}
+
+class Stopwatch {
+ public:
+  explicit Stopwatch(double* seconds) : seconds_(seconds), start_(Clock::now()) {}
+  void lap() {
+    const auto now = Clock::now();
+    if (seconds_ != nullptr) *seconds_++ = std::chrono::duration<double>(now - start_).count();
+    start_ = now;
+  }
+
+ private:
+  using Clock = std::chrono::steady_clock;
+  double* seconds_;
+  Clock::time_point start_;
+};
+
+}  // namespace
+
+// Renders `scene` to color [h, w, 3] and alpha [h, w]. `radii` [n] (px, 0 where not visible) and `seconds` [4] (time of
+// project, sort, bin, composite) may be null. Returns what tgb_raster_backward needs, or null when out of memory;
+// hand it back with tgb_raster_release.
+TGB_API tgb::Frame* tgb_raster_forward(const tgb::Scene* scene, float* color, float* alpha, int32_t* radii,
+                                       double* seconds) {
+  tgb::Frame* frame = nullptr;
+  try {
+    frame = take_frame();
+    const tgb::Kernels& kernels = tgb::kernels();
+    Stopwatch watch(seconds);
+    kernels.project_forward(*frame, *scene, radii);
+    watch.lap();
+    tgb::sort_by_depth(*frame, *scene);
+    watch.lap();
+    tgb::bin_into_tiles(*frame, *scene);
+    watch.lap();
+    kernels.composite_forward(*frame, *scene, color, alpha);
+    watch.lap();
+    return frame;
+  } catch (const std::bad_alloc&) {
+    delete frame;
+    return nullptr;
+  }
+}
+
+// Gradients of the image that tgb_raster_forward made from the same scene. `seconds` [2] (composite, project) may be
+// null. May be called again for the same frame. Returns 0 when out of memory.
+TGB_API int tgb_raster_backward(tgb::Frame* frame, const tgb::Scene* scene, const tgb::Gradients* gradients,
+                                double* seconds) {
+  try {
+    const tgb::Kernels& kernels = tgb::kernels();
+    Stopwatch watch(seconds);
+    kernels.composite_backward(*frame, *scene, *gradients);
+    watch.lap();
+    kernels.project_backward(*frame, *scene, *gradients);
+    watch.lap();
+    return 1;
+  } catch (const std::bad_alloc&) {
+    return 0;
+  }
+}
+
+TGB_API void tgb_raster_release(tgb::Frame* frame) {
+  std::lock_guard<std::mutex> lock(frames_mutex);
+  free_frames.push_back(frame);
+}
+
+// Sizes of a frame: visible Gaussians, (Gaussian, tile) pairs, tiles.
+TGB_API void tgb_raster_counts(const tgb::Frame* frame, int32_t* counts) {
+  counts[0] = frame->visible, counts[1] = static_cast<int32_t>(frame->pairs), counts[2] = frame->tiles_x * frame->tiles_y;
+}
