@@ -19,6 +19,7 @@ from toonifygb import avatar as avatars
 from toonifygb import face, head, stylize, track, train, video
 from toonifygb.config import from_json, to_json
 from toonifygb.errors import FaceError, InputError
+from toonifygb.pipeline.files import load_landmarks, save_landmarks
 from toonifygb.pipeline.outcome import outcome
 from toonifygb.pipeline.source import Source
 from toonifygb.pipeline.stages import STATE_FILE
@@ -98,7 +99,7 @@ def find_landmarks(source: Source, run: Run, config: RunConfig) -> str:
         landmarks, report = face.find_landmarks(clip, config.face, n_frames=source.info.n_frames, progress=progress)
         run.problems("video", list(clip.problems))
         run.problems("face", list(report.problems))
-        face.save_landmarks(landmarks, path)
+        save_landmarks(landmarks, path)
 
     return run.stage(
         "landmarks",
@@ -114,8 +115,8 @@ def stylize_clip(source: Source, run: Run, config: RunConfig, found: str) -> str
     out = run.file("stylized.mp4")
 
     def work(progress: Progress) -> None:
-        landmarks = face.load_landmarks(run.work("landmarks.safetensors"))
-        write_stylized(source, out, config, landmarks, run.work("stylized"), progress)
+        landmarks = load_landmarks(run.work("landmarks.safetensors"))
+        write_stylized(source, out, config, landmarks, progress)
 
     return run.stage(
         "stylize",
@@ -131,69 +132,63 @@ def write_stylized(
     out: Path,
     config: RunConfig,
     landmarks: Landmarks,
-    parts_dir: Path,
     progress: Progress,
 ) -> None:
     """Streams the clip through its style into ``out``."""
     stylizer = stylize.get(config.stylize.style)
+    strength = config.stylize.strength
     n = landmarks.points.shape[0]
     with closing(source.frames(config)) as frames:
-        state = stylize.prepare(stylizer, sample_frames(frames, n), landmarks)
+        state = stylize.prepare(frames, landmarks, stylizer, strength=strength)
     info = source.info
-    with video.Writer(out, info.width, info.height, info.fps, audio_from=source.path) as writer:
-        frames = source.frames(config)
-        styled = stylize.stylize_frames(frames, landmarks, stylizer, state, strength=config.stylize.strength)
+    with (
+        video.Writer(out, info.width, info.height, info.fps, audio_from=source.path) as writer,
+        closing(source.frames(config)) as frames,
+    ):
+        styled = stylize.stylize_frames(frames, landmarks, stylizer, state, strength=strength)
         for done, frame in enumerate(styled, start=1):
             writer.write(frame)
             progress.update(done, n)
 
 
-def sample_frames(frames: Iterable[np.ndarray], n_frames: int, n_samples: int = 12) -> dict[int, np.ndarray]:
-    """Frames spread evenly over a clip, by number."""
-    wanted = set(np.linspace(0, max(n_frames - 1, 0), min(n_samples, n_frames)).round().astype(int).tolist())
-    samples = {}
-    for index, frame in enumerate(frames):
-        if index in wanted:
-            samples[index] = frame
-        if len(samples) == len(wanted):
-            break
-    return samples
-
-
 def choose_landmarks(run: Run, config: RunConfig, found: str, styled: str) -> str:
-    """Landmarks that the head model is fitted to: the original's or the stylised video's."""
+    """Landmarks that the head model is fitted to: the original's, carried along by the style's caricature, or those
+    found anew in the stylised video.
+    """
     out = run.work("landmarks_chosen.safetensors")
 
     def work(progress: Progress) -> None:
-        original = face.load_landmarks(run.work("landmarks.safetensors"))
-        mode = config.track.on
-        if config.stylize.style == "none" or mode == "original":
-            choice, reason = "original", ""
-        else:
-            frames = video.read(run.file("stylized.mp4"))
-            try:
-                stylized, _ = face.find_landmarks(
-                    frames, config.face, n_frames=original.points.shape[0], progress=progress
-                )
-            except FaceError:
-                if mode == "stylized":
-                    raise
-                stylized = None
-            if mode == "stylized":
-                choice, reason = "stylized", ""
-            elif stylized is None:
-                choice, reason = "original", "the face is not found in the stylised video"
-            else:
-                choice, reason = track.choose_source(original, stylized)
-            if choice == "stylized" and stylized is not None:
-                original = stylized
+        original = load_landmarks(run.work("landmarks.safetensors"))
+        stylizer = stylize.get(config.stylize.style)
+        carried = stylize.warp_landmarks(original, stylizer, config.stylize.strength)
+        choice, reason, chosen = "original", "", carried
+        if config.track.on != "original" and config.stylize.style != "none":
+            choice, reason, chosen = _compare_landmarks(run, config, carried, progress)
         run.state["track_on"] = {"choice": choice, "reason": reason}
         if reason:
             run.reporter.note(f"tracking the {choice} video: {reason}")
-        face.save_landmarks(original, out)
+        save_landmarks(chosen, out)
 
-    inputs = [found, styled, config.track.on, config.face]
+    inputs = [found, styled, config.track.on]
     return run.stage("source", "choosing what to track", inputs=inputs, outputs=[out], work=work)
+
+
+def _compare_landmarks(
+    run: Run, config: RunConfig, carried: Landmarks, progress: Progress
+) -> tuple[str, str, Landmarks]:
+    """Choice, reason and landmarks when the stylised video is a candidate."""
+    frames = video.read(run.file("stylized.mp4"))
+    n = carried.points.shape[0]
+    try:
+        stylized, _ = face.find_landmarks(frames, config.face, n_frames=n, progress=progress)
+    except FaceError:
+        if config.track.on == "stylized":
+            raise
+        return "original", "the face is not found in the stylised video", carried
+    if config.track.on == "stylized":
+        return "stylized", "as asked for", stylized
+    choice = track.choose_source(carried, stylized)
+    return choice.on, choice.reason, stylized if choice.on == "stylized" else carried
 
 
 def fit_track(source: Source, run: Run, config: RunConfig, chosen: str) -> str:
@@ -201,7 +196,7 @@ def fit_track(source: Source, run: Run, config: RunConfig, chosen: str) -> str:
     out, overlay_path = run.file("track.safetensors"), run.file("overlay.mp4")
 
     def work(progress: Progress) -> None:
-        landmarks = face.load_landmarks(run.work("landmarks_chosen.safetensors"))
+        landmarks = load_landmarks(run.work("landmarks_chosen.safetensors"))
         model = head.load("open")
         sequence = track.fit(
             landmarks,
@@ -211,29 +206,19 @@ def fit_track(source: Source, run: Run, config: RunConfig, chosen: str) -> str:
             source_sha256=source.sha256,
             progress=progress,
         )
-        run.problems("track", track_problems(sequence))
+        run.problems("track", list(track.report(sequence).problems))
         with video.Writer(
             overlay_path, source.info.width, source.info.height, source.info.fps, audio_from=source.path
         ) as writer:
             for index, frame in enumerate(video.read(run.file("stylized.mp4"), max_frames=sequence.n_frames)):
                 cropped = frame[: source.info.height, : source.info.width]
-                writer.write(track.draw_overlay(cropped, sequence, index, model))
+                writer.write(track.draw(cropped, sequence, index, model))
                 progress.update(index + 1, sequence.n_frames)
         track.save(sequence, out)
 
     return run.stage(
         "track", "tracking the head", inputs=[chosen, config.track], outputs=[out, overlay_path], work=work
     )
-
-
-def track_problems(sequence: TrackedSequence) -> list[str]:
-    """What the fit says about the clip, one sentence each."""
-    lost = int((~sequence.tracked).sum())
-    if not lost:
-        return []
-    return [
-        f"the face is lost in {lost} of {sequence.n_frames} frames; the motion there is bridged and not trained on"
-    ]
 
 
 def check_trainable(run: Run, source: Source) -> None:

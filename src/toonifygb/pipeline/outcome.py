@@ -65,8 +65,8 @@ def score(source: Source, run: Run, config: RunConfig, trained: str) -> str:
             threads=config.threads,
             progress=progress,
         )
-        steadiness = metrics.steadiness(video.read(run.file("stylized.mp4")))
-        write_json(out, {**held_out, **steadiness})
+        steadiness = metrics.stability(video.read(run.file("stylized.mp4")))
+        write_json(out, {**held_out, "itf": steadiness.itf, "isi": steadiness.isi})
 
     return run.stage("scores", "judging on held-out frames", inputs=[trained], outputs=[out], work=work)
 
@@ -114,7 +114,7 @@ def write_report(source: Source, run: Run, config: RunConfig, scored: str, shown
     def work(progress: Progress) -> None:
         sheet.mkdir(exist_ok=True)
         for name, image in report_pictures(run, config).items():
-            (sheet / f"{name}.jpg").write_bytes(video.jpeg(image))
+            (sheet / f"{name}.jpg").write_bytes(video.encode_jpeg(image))
 
     run.stage("report", "writing the report", inputs=[scored, shown], outputs=[sheet], work=work)
     scores = json.loads(run.work("scores.json").read_text())
@@ -139,7 +139,6 @@ def metrics_record(source: Source, run: Run, config: RunConfig, scores: dict[str
         "style": config.stylize.style,
         "quality": config.quality,
         **scores,
-        "lpips": None,
         "n_frames": sequence.n_frames,
         "n_train": len(dataset.split.train),
         "n_test": len(dataset.split.test),

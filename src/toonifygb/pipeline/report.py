@@ -77,7 +77,7 @@ def render_report(report: Report) -> str:
 
 
 def _style() -> str:
-    return resources.files(__package__).joinpath(_STYLE_FILE).read_text()
+    return resources.files("toonifygb.pipeline").joinpath(_STYLE_FILE).read_text()
 
 
 def _text(value: str) -> str:

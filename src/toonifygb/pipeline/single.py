@@ -34,10 +34,10 @@ def stylize_file(clip: Path, out: Path, config: RunConfig, reporter: Reporter) -
         raise InputError(f"output {out} does not end in .mp4; stylised clips are written as mp4")
     source = open_source(clip, config)
     progress = reporter.stage("landmarks", "finding the face")
-    opened = video.open_clip(clip, max_frames=config.max_frames)
+    opened = video.open_clip(clip)
     try:
         landmarks, report = face.find_landmarks(
-            opened, config.face, n_frames=source.info.n_frames, progress=progress
+            source.frames(config), config.face, n_frames=source.n_frames(config), progress=progress
         )
         problems = list(report.problems)
     except FaceError as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,9 +24,14 @@ class Source:
     info: VideoInfo
     sha256: str
 
-    def frames(self, config: RunConfig) -> Iterator[np.ndarray]:
+    def frames(self, config: RunConfig) -> Generator[np.ndarray, None, None]:
         """Its frames from the start, streaming."""
-        return video.read(self.path, max_frames=config.max_frames)
+        yield from video.read(self.path, max_frames=config.max_frames)
+
+    def n_frames(self, config: RunConfig) -> int | None:
+        """How many frames to expect; ``None`` when the container does not say."""
+        known = (n for n in (self.info.n_frames, config.max_frames) if n is not None)
+        return min(known, default=None)
 
 
 def open_source(clip: Path, config: RunConfig) -> Source:

@@ -1,0 +1,37 @@
+"""Intermediates of a run that belong to no single room."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from toonifygb.errors import InputError
+from toonifygb.structures import Landmarks
+
+
+def save_landmarks(landmarks: Landmarks, path: Path) -> None:
+    """Writes landmarks so that the file is at no moment half there."""
+    temporary = path.with_name(f".{path.name}.part")
+    size = {"width": str(landmarks.width), "height": str(landmarks.height)}
+    tensors = {"points": landmarks.points.contiguous(), "score": landmarks.score.contiguous()}
+    save_file(tensors, temporary, metadata=size)
+    os.replace(temporary, path)
+
+
+def load_landmarks(path: Path) -> Landmarks:
+    """Landmarks from ``save_landmarks``.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            size = file.metadata()
+            return Landmarks(
+                file.get_tensor("points"), file.get_tensor("score"), int(size["width"]), int(size["height"])
+            )
+    except (SafetensorError, KeyError, TypeError) as error:
+        raise InputError(f"{path} does not hold landmarks ({error})", "delete it and run again") from error
