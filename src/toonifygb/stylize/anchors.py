@@ -206,3 +206,28 @@ def skin_pixels(labs: list[np.ndarray], faces: Faces) -> Float[np.ndarray, "n 3"
         inside = mask(shape, [points[list(OVAL)]], 0.0) * (1.0 - mask(shape, holes, 0.0))
         found.append(lab[inside > 0.5][::3])
     return np.concatenate(found)
+
+
+def feature_mask(shape: tuple[int, int], points: Points, unit: float) -> Plane:
+    """Soft mask of eyes, brows and mouth, which must stay readable under any simplification."""
+    parts = [outline_of_eye(points, eye) for eye in EYES] + [points[list(eye.brow)] for eye in EYES]
+    parts.append(points[list(LIPS)])
+    return np.minimum(2.0 * mask(shape, parts, 0.02 * unit), 1.0)
+
+
+def frontal(faces: Faces) -> Float[np.ndarray, "478 2"]:
+    """Landmarks of the sample whose face is seen most from the front; zeros when there is none."""
+    if not (faces.presence > 0).any():
+        return np.zeros((N_POINTS, 2), np.float32)
+    left, right, nose = faces.points[:, 454], faces.points[:, 234], faces.points[:, 1]
+    near = np.linalg.norm(nose - left, axis=1)
+    far = np.linalg.norm(nose - right, axis=1)
+    turned = np.abs(near - far) / np.maximum(near + far, 1e-6)
+    return faces.points[int(np.argmin(np.where(faces.presence > 0, turned, np.inf)))].copy()
+
+
+def anatomy(shape: tuple[int, int], points: Points, unit: float) -> Plane:
+    """Where a draughtsman looks for lines even if the picture shows them faintly: jaw and nose; 0..1.5."""
+    jaw = ribbon(shape, points[list(JAW_LINE)], 0.05 * unit, 0.02 * unit)
+    nose = ribbon(shape, points[list(NOSE_BASE)], 0.05 * unit, 0.02 * unit)
+    return 1.5 * np.maximum(jaw, nose)

@@ -88,8 +88,14 @@ def sample(image: np.ndarray, where: Field, interpolation: int = cv2.INTER_LINEA
     return cv2.remap(image, where, no_second_map, interpolation, borderMode=BORDER)
 
 
-def structure(lab: Picture, sigma_px: float) -> tuple[Field, Plane]:
+def structure(lab: Picture, sigma_px: float, rest: tuple[float, float] = (0.0, 0.0)) -> tuple[Field, Plane]:
     """Direction along edges and how clear it is, from the smoothed structure tensor of all channels.
+
+    Args:
+        lab: the picture.
+        sigma_px: over how far directions are averaged.
+        rest: direction (rad) that the tangents take where the picture has none, and its weight in squared Lab
+            units per px²; keeps strokes in flat areas from following noise.
 
     Returns:
         unit tangents (sign arbitrary) and anisotropy 0 (no direction) .. 1 (a straight edge).
@@ -98,19 +104,28 @@ def structure(lab: Picture, sigma_px: float) -> tuple[Field, Plane]:
     dy = cv2.Sobel(lab, cv2.CV_32F, 0, 1, ksize=3, scale=0.125, borderType=BORDER)
     tensor = cv2.merge([dot(dx, dx), dot(dx, dy), dot(dy, dy)])
     tensor = blur(tensor, sigma_px)
-    xx, xy, yy = tensor[..., 0], tensor[..., 1], tensor[..., 2]
-    angle = 0.5 * np.arctan2(2.0 * xy, xx - yy) + np.float32(np.pi / 2)
+    angle, weight = rest
+    xx = tensor[..., 0] + np.float32(weight * np.sin(angle) ** 2)
+    xy = tensor[..., 1] - np.float32(weight * np.sin(angle) * np.cos(angle))
+    yy = tensor[..., 2] + np.float32(weight * np.cos(angle) ** 2)
+    tangent = 0.5 * np.arctan2(2.0 * xy, xx - yy) + np.float32(np.pi / 2)
     spread = np.sqrt((xx - yy) ** 2 + 4.0 * xy * xy)
     # 0.05 squared Lab units per px²: below it the direction is sensor noise, and claims no clarity
-    return cv2.merge([np.cos(angle), np.sin(angle)]), spread / (xx + yy + np.float32(0.05))
+    return cv2.merge([np.cos(tangent), np.sin(tangent)]), spread / (xx + yy + np.float32(0.05))
 
 
-def flow_blur(image: np.ndarray, tangents: Field, sigma_px: float) -> np.ndarray:
+def flow_blur(image: np.ndarray, tangents: Field, sigma_px: float, step_px: float | None = None) -> np.ndarray:
     """Gaussian blur along the edge direction: calms lines and merges strokes without widening them.
 
     The path is the straight tangent; over the few px used here it does not leave the edge.
+
+    Args:
+        image: one channel or several.
+        tangents: unit directions.
+        sigma_px: standard deviation along them.
+        step_px: distance of the samples; must not exceed the finest grain of the image. 0.6 sigma when unset.
     """
-    step = max(1.0, sigma_px * 0.6)
+    step = max(1.0, sigma_px * 0.6) if step_px is None else step_px
     grid = pixel_grid(*image.shape[:2])
     total, weight_sum = image.copy(), 1.0
     for index in range(1, max(1, round(2.0 * sigma_px / step)) + 1):

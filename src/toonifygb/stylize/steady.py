@@ -1,8 +1,8 @@
 """Sensor and compression noise calmed in time, from a symmetric window of source frames.
 
 Noise is what makes bands and lines boil. Each frame is averaged with its neighbours after these are moved onto it
-by optical flow, where they agree with it. A frame depends on its neighbours in the source alone, so the result is the
-same however a clip is cut into chunks.
+by optical flow, where they agree with it. A frame depends on its neighbours in the source alone, so the result is
+the same however a clip is cut into chunks.
 """
 
 from __future__ import annotations

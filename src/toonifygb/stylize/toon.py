@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from toonifygb.stylize import features, filters
-from toonifygb.stylize.anchors import JAW_LINE, NOSE_BASE, face_mask, face_unit, ribbon, skin_pixels
+from toonifygb.stylize.anchors import anatomy, face_mask, face_unit, skin_pixels
 from toonifygb.stylize.exaggerate import Exaggeration
 from toonifygb.stylize.filters import blur, mix, smoothstep
 
@@ -104,15 +104,8 @@ def _simplified(lab: Lab, points: Points, presence: float, state: dict[str, Any]
         simple[..., 1:] = mix(simple[..., 1:], blur(simple[..., 1:], 0.06 * unit), 0.7 * inside * skin)
     response = filters.ink_response(mix(simple[..., 0], lab[..., 0], 0.75), tangents, 0.008 * unit)
     if presence > 0:
-        response *= 1.0 + np.float32(presence) * _anatomy(lab.shape[:2], points, unit)
+        response *= 1.0 + np.float32(presence) * anatomy(lab.shape[:2], points, unit)
     return np.dstack([simple, skin, response])
-
-
-def _anatomy(shape: tuple[int, int], points: Points, unit: float) -> Plane:
-    """Where a draughtsman looks for lines even if the picture shows them faintly: jaw and nose; 0..1.5."""
-    jaw = ribbon(shape, points[list(JAW_LINE)], 0.05 * unit, 0.02 * unit)
-    nose = ribbon(shape, points[list(NOSE_BASE)], 0.05 * unit, 0.02 * unit)
-    return 1.5 * np.maximum(jaw, nose)
 
 
 def _shaded(fields: np.ndarray, state: dict[str, Any]) -> Lab:
