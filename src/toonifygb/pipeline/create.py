@@ -85,9 +85,7 @@ def read_request(path: Path) -> tuple[Path, RunConfig]:
         request = json.loads((path / STATE_FILE).read_text())["request"]
         return Path(request["clip"]), from_json(json.dumps(request["config"]))
     except (OSError, KeyError, ValueError) as error:
-        raise InputError(
-            f"{path} is not a run of toonifygb ({type(error).__name__})", "make one with: toonifygb create CLIP"
-        ) from error
+        raise InputError(f"{path} is not a run of toonifygb", "make one with: toonifygb create CLIP") from error
 
 
 def find_landmarks(source: Source, run: Run, config: RunConfig) -> str:
@@ -95,8 +93,11 @@ def find_landmarks(source: Source, run: Run, config: RunConfig) -> str:
     path = run.work("landmarks.safetensors")
 
     def work(progress: Progress) -> None:
-        clip = video.open_clip(source.path, max_frames=config.max_frames)
-        landmarks, report = face.find_landmarks(clip, config.face, n_frames=source.info.n_frames, progress=progress)
+        clip = video.open_clip(source.path)
+        frames = itertools.islice(clip, config.max_frames)
+        landmarks, report = face.find_landmarks(
+            frames, config.face, n_frames=source.n_frames(config), progress=progress
+        )
         run.problems("video", list(clip.problems))
         run.problems("face", list(report.problems))
         save_landmarks(landmarks, path)

@@ -15,6 +15,7 @@ import json
 import logging
 import os
 import resource
+import shutil
 import sys
 import time
 from dataclasses import dataclass, field
@@ -92,6 +93,7 @@ class Run:
     reporter: Reporter
     state: dict[str, Any] = field(default_factory=dict)
     _lock: int | None = None
+    _is_new: bool = False
 
     def __enter__(self) -> Run:
         self._make_folder()
@@ -113,6 +115,9 @@ class Run:
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
+        finished = any(entry.get("finished") for entry in self.state.get("stages", {}).values())
+        if error is not None and self._is_new and not finished:
+            shutil.rmtree(self.path, ignore_errors=True)  # a request that failed at once leaves nothing behind
 
     def _make_folder(self) -> None:
         try:
@@ -132,7 +137,8 @@ class Run:
                 "pass a new or empty folder with --out",
             )
         (self.path / "work").mkdir(exist_ok=True)
-        if not (self.path / STATE_FILE).exists():
+        self._is_new = not (self.path / STATE_FILE).exists()
+        if self._is_new:
             write_json(self.path / STATE_FILE, {"stages": {}, "problems": {}, "version": __version__})
 
     def _take_lock(self) -> None:
