@@ -22,9 +22,13 @@ if TYPE_CHECKING:
     from av import VideoFrame
     from av.container import InputContainer
     from av.video.stream import VideoStream
-    from jaxtyping import UInt8
+    from jaxtyping import Float, UInt8
 
 _FALLBACK_FPS = 25.0
+_MAX_MISSING_SECONDS = 0.5
+"""A clip shorter than it promises by more than this counts as cut off; sound often ends a little early."""
+_MAX_REORDER = 16
+"""Most pictures by which H.264 and HEVC store one later than it is shown."""
 _NOT_VIDEO = ("tty", "subviewer", "srt", "ass")
 """FFmpeg renders plain text as if it were a clip; nobody means that here."""
 _MAX_PIXEL_STRETCH = 0.15
@@ -128,34 +132,45 @@ class _Timing:
 
 
 def _scan(container: InputContainer, stream: VideoStream) -> _Timing:
-    """Reads all packets of the stream (no decoding) for their number and spacing."""
+    """Reads all packets (no decoding) for their number, their spacing and where they end."""
     times: list[int] = []
-    n_packets = 0
+    n_packets, end = 0, 0.0
     try:
-        for packet in container.demux(stream):
-            if packet.size and not packet.is_discard:
+        for packet in container.demux():
+            if packet.pts is not None:
+                end = max(end, float((packet.pts + (packet.duration or 0)) * packet.time_base))
+            if packet.stream_index == stream.index and packet.size and not packet.is_discard:
                 n_packets += 1
                 if packet.pts is not None:
                     times.append(packet.pts)
     except FFmpegError:
         pass  # the decoding pass meets the same damage and notes it
-    n_frames = n_packets or None
     declared = float(stream.average_rate or stream.guessed_rate or 0)
-    if len(times) < n_packets or len(times) < 2 or stream.time_base is None:
+    fps, findings = _pace(np.array(times, np.float64) * float(stream.time_base or 0), n_packets, declared)
+    promised = ((container.duration or 0) + max(container.start_time or 0, 0)) / av.time_base
+    if promised > end + _MAX_MISSING_SECONDS and times:
+        findings.append(f"ends early: it promises {promised:.1f} s and holds {end:.1f} s")
+    return _Timing(fps, n_packets or None, tuple(findings))
+
+
+def _pace(times: Float[np.ndarray, " n"], n_packets: int, declared: float) -> tuple[float, list[str]]:
+    """Mean frames per second from the time stamps, s, and what is remarkable about them."""
+    if len(times) < max(n_packets, 2) or np.ptp(times) == 0:
         if declared:
-            return _Timing(declared, n_frames, ())
-        finding = f"does not tell its pace; taken as {_FALLBACK_FPS:g} frames per second"
-        return _Timing(_FALLBACK_FPS, n_frames, (finding,))
-    seconds = np.sort(np.array(times, np.float64)) * float(stream.time_base)
-    steps = np.diff(seconds)
-    measured = len(steps) / max(seconds[-1] - seconds[0], 1e-9)
+            return declared, []
+        return _FALLBACK_FPS, [f"does not tell its pace; taken as {_FALLBACK_FPS:g} frames per second"]
+    # At the end of a cut-off file pictures shown earlier but stored later are missing: gaps that mean nothing.
+    steps = np.diff(np.sort(times))
+    regular = steps[: len(steps) - min(_MAX_REORDER, len(steps) // 2)]
+    typical = float(np.median(regular))
+    if (np.abs(regular - typical) > 0.5 * typical).any():
+        fps = 1 / float(steps.mean())
+        return fps, [
+            f"has a variable frame rate; its frames are kept as they are, at {fps:.4g} per second on average"
+        ]
+    fps = 1 / float(regular.mean())
     # The declared rate is exact where it agrees; time stamps are rounded.
-    fps = declared if abs(declared - measured) < 0.002 * measured else measured
-    typical = float(np.median(steps))
-    if (np.abs(steps - typical) > 0.5 * typical).any():
-        finding = f"has a variable frame rate; its frames are kept as they are, at {fps:.4g} per second on average"
-        return _Timing(fps, n_frames, (finding,))
-    return _Timing(fps, n_frames, ())
+    return (declared if abs(declared / fps - 1) < 0.002 else fps), []
 
 
 def _pictures(container: InputContainer, stream: VideoStream, note: Callable[[str], None]) -> Iterator[VideoFrame]:
@@ -184,8 +199,6 @@ def _pictures(container: InputContainer, stream: VideoStream, note: Callable[[st
         if not picture.is_corrupt:
             n_good += 1
             yield picture
-    if n_good < stream.frames:
-        note(f"ends early: it promises {stream.frames} frames and holds {n_good}")
 
 
 def _drain(stream: VideoStream) -> Iterator[VideoFrame]:

@@ -118,7 +118,9 @@ class PictureFormat:
             dst_color_range=ColorRange.JPEG,
             interpolation=_QUALITY,
         )
-        return converted.to_ndarray()
+        image = converted.to_ndarray()
+        # A picture that needed no conversion still belongs to the decoder, which may predict the next one from it.
+        return image.copy() if converted is frame else image
 
 
 def flatten_alpha(image: UInt8[np.ndarray, "h w 4"]) -> tuple[UInt8[np.ndarray, "h w 3"], bool]:

@@ -72,6 +72,7 @@ class Writer:
                 f"output {self.path} does not end in .mp4", f"write to {self.path.with_suffix('.mp4')}"
             )
         with self._explained():
+            self._part.touch()  # FFmpeg opens it only with the first frame, too late to complain
             # The whole index in front lets players start before the file has arrived.
             self._container = av.open(f"file:{self._part}", "w", format="mp4", options={"movflags": "+faststart"})
         try:
