@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from toonifygb import __version__
-from toonifygb.errors import InputError
+from toonifygb.errors import InputError, ToonifyError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -116,7 +116,7 @@ class Run:
             os.close(self._lock)
             self._lock = None
         finished = any(entry.get("finished") for entry in self.state.get("stages", {}).values())
-        if error is not None and self._is_new and not finished:
+        if isinstance(error, ToonifyError) and self._is_new and not finished:
             shutil.rmtree(self.path, ignore_errors=True)  # a request that failed at once leaves nothing behind
 
     def _make_folder(self) -> None:
