@@ -1,33 +1,13 @@
 // Memory of the engine: 64-byte aligned, grow-only, uninitialised, on huge pages where the system offers them.
 #pragma once
 #include <cstddef>
-#include <cstdlib>
-#include <new>
-
-#if defined(__linux__)
-#include <sys/mman.h>
-#endif
-#if defined(_WIN32)
-#include <malloc.h>
-#endif
 
 namespace tgb {
 
-inline void* aligned_allocate(size_t alignment, size_t bytes) {
-#if defined(_WIN32)
-  return _aligned_malloc(bytes, alignment);
-#else
-  return aligned_alloc(alignment, bytes);
-#endif
-}
-
-inline void aligned_release(void* memory) {
-#if defined(_WIN32)
-  _aligned_free(memory);
-#else
-  free(memory);
-#endif
-}
+// Frees `memory` and returns room for at least `count` items of `item_size`; sets `capacity`. Throws std::bad_alloc.
+// (Not part of the template: a template would be compiled per instruction set and merged by the linker.)
+void* reallocate(void* memory, size_t count, size_t item_size, size_t& capacity);
+void release(void* memory);
 
 // Fresh pages cost more than the work done in them (14-60 ms for 15 MB), so a buffer keeps what it once had.
 template <class T>
@@ -36,28 +16,19 @@ class Buffer {
   Buffer() = default;
   Buffer(const Buffer&) = delete;
   Buffer& operator=(const Buffer&) = delete;
-  ~Buffer() { aligned_release(data_); }
+  ~Buffer() { release(data_); }
 
   // Memory for at least `count` items; the former contents are lost when it has to grow.
-  T* need(size_t count) {
+  __attribute__((always_inline)) T* need(size_t count) {
     if (count > capacity_) {
-      aligned_release(data_);
-      capacity_ = count + count / 4 + 1024;
-      const size_t huge = size_t{2} << 20, raw = capacity_ * sizeof(T), alignment = raw >= huge / 2 ? huge : 64;
-      const size_t bytes = (raw + alignment - 1) / alignment * alignment;
-      data_ = static_cast<T*>(aligned_allocate(alignment, bytes));
-      if (data_ == nullptr) {
-        capacity_ = 0;
-        throw std::bad_alloc();
-      }
-#if defined(__linux__)
-      if (alignment == huge) madvise(data_, bytes, MADV_HUGEPAGE);
-#endif
+      void* old = data_;
+      data_ = nullptr;
+      data_ = static_cast<T*>(reallocate(old, count, sizeof(T), capacity_));
     }
     return data_;
   }
-  T* data() const { return data_; }
-  T& operator[](size_t index) const { return data_[index]; }
+  __attribute__((always_inline)) T* data() const { return data_; }
+  __attribute__((always_inline)) T& operator[](size_t index) const { return data_[index]; }
   void swap(Buffer& other) {
     T* data = data_;
     const size_t capacity = capacity_;

@@ -1,6 +1,7 @@
 // Choice of the instruction set at run time.
 #pragma once
 #include "raster.h"
+#include "training.h"
 
 namespace tgb {
 
@@ -10,6 +11,13 @@ struct Kernels {
   void (*composite_forward)(Frame&, const Scene&, float* color, float* alpha);
   void (*composite_backward)(Frame&, const Scene&, const Gradients&);
   void (*project_backward)(Frame&, const Scene&, const Gradients&);
+  void (*blend)(const float* base, const void* deltas, bool bf16, const float* psi, int k, int64_t p, float* out,
+                int threads);
+  void (*adam)(float* parameters, float* first, float* second, const float* gradient, const float* rates, int64_t p,
+               const AdamRates& adam_rates, int threads);
+  void (*blend_adam)(const BlendState& state, const AdamRates& adam_rates, int threads);
+  double (*l1_dssim)(const float* image, const float* target, int height, int width, float l1_weight,
+                     float dssim_weight, float* gradient, SimilarityWork& work, int threads);
 };
 
 // The kernels of the best instruction set this machine has, or of the one set_isa chose.

@@ -6,10 +6,11 @@
 namespace tgb {
 namespace TGB_ISA {
 
-// Pixel centres of every block, and each block's first pixel, relative to the tile.
+// Pixel centres of every block, and each block's first pixel, relative to the tile. A constant expression: code run
+// at load time must not use an instruction set the machine may lack.
 struct BlockTable {
   alignas(64) float x[kBlocks][kLanes], y[kBlocks][kLanes], left[kBlocks], top[kBlocks];
-  BlockTable() {
+  constexpr BlockTable() : x{}, y{}, left{}, top{} {
     for (int b = 0; b < kBlocks; b++) {
       left[b] = static_cast<float>(b % kBlocksAcross * kBlock), top[b] = static_cast<float>(b / kBlocksAcross * kBlock);
       for (int l = 0; l < kLanes; l++)
@@ -17,7 +18,7 @@ struct BlockTable {
     }
   }
 };
-static const BlockTable kBlockTable;
+static constexpr BlockTable kBlockTable{};
 
 // One screen tile: its place in the image and its part inside it.
 struct TileView {

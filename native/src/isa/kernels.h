@@ -4,6 +4,7 @@
 #include "pool.h"
 #include "raster.h"
 #include "simd.h"
+#include "training.h"
 
 namespace tgb {
 namespace TGB_ISA {
@@ -12,6 +13,14 @@ void project_forward(Frame& frame, const Scene& scene, int32_t* radii);
 void composite_forward(Frame& frame, const Scene& scene, float* color, float* alpha);
 void composite_backward(Frame& frame, const Scene& scene, const Gradients& gradients);
 void project_backward(Frame& frame, const Scene& scene, const Gradients& gradients);
+
+void blend(const float* base, const void* deltas, bool bf16, const float* psi, int k, int64_t p, float* out,
+           int threads);
+void adam(float* parameters, float* first, float* second, const float* gradient, const float* rates, int64_t p,
+          const AdamRates& adam_rates, int threads);
+void blend_adam(const BlendState& state, const AdamRates& adam_rates, int threads);
+double l1_dssim(const float* image, const float* target, int height, int width, float l1_weight, float dssim_weight,
+                float* gradient, SimilarityWork& work, int threads);
 
 }  // namespace TGB_ISA
 }  // namespace tgb

@@ -11,7 +11,7 @@ from toonifygb.render import library
 from toonifygb.render.base import DEFAULT_CONSTANTS, RasterConstants, Renderer, RenderInfo
 
 if TYPE_CHECKING:
-    from toonifygb.render.kernels import Kernels
+    from toonifygb.render.fused import Kernels
 
 __all__ = ["DEFAULT_CONSTANTS", "RasterConstants", "RenderInfo", "Renderer", "get", "kernels"]
 
@@ -58,9 +58,9 @@ def get(backend: str = "auto", threads: int | None = None) -> Renderer:
 def kernels(backend: str = "auto", threads: int | None = None) -> Kernels:
     """Fused training kernels by name; arguments and errors as in ``get``."""
     if _resolve(backend) == "native":
-        from toonifygb.render.native_kernels import NativeKernels
+        from toonifygb.render.native_fused import NativeKernels
 
         return NativeKernels(threads)
-    from toonifygb.render.kernels import ReferenceKernels
+    from toonifygb.render.fused import ReferenceKernels
 
     return ReferenceKernels()

@@ -7,7 +7,7 @@ import functools
 import importlib.metadata
 import logging
 import os
-from ctypes import POINTER, Structure, c_char_p, c_double, c_float, c_int32, c_void_p
+from ctypes import POINTER, Structure, c_char_p, c_double, c_float, c_int32, c_int64, c_void_p
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 STEM = "toonifygb_native"
 PATH_VARIABLE = "TOONIFYGB_NATIVE_LIB"
-"""Environment variable naming the library file; looked for beside this file and in the installed package if unset."""
+"""Environment variable naming the library file; searched for beside this file and in the installation if unset."""
 ISA_VARIABLE = "TOONIFYGB_NATIVE_ISA"
 """Environment variable forcing an instruction set: avx512, avx2 or generic; the best available if unset."""
 BUILD_HINT = "reinstall the package with g++ or clang++ on the PATH, or use the reference backend"
@@ -80,6 +80,23 @@ class Gradients(Structure):
     ]
 
 
+class AdamRates(Structure):
+    """Mirrors ``tgb::AdamRates`` of native/src/training.h."""
+
+    _fields_ = [("beta1", c_double), ("beta2", c_double), ("eps", c_double), ("step", c_int64)]
+
+
+class BlendState(Structure):
+    """Mirrors ``tgb::BlendState``."""
+
+    _fields_ = [
+        *((name, c_void_p) for name in ("deltas", "first_moment", "second_moment")),
+        *((name, c_void_p) for name in ("psi", "gradient", "learning_rates", "scale", "widths")),
+        ("p", c_int64),
+        *((name, c_int32) for name in ("k", "n", "groups", "skip_inactive")),
+    ]
+
+
 _SIGNATURES = {
     "tgb_isa": (c_char_p, []),
     "tgb_set_isa": (c_int32, [c_char_p]),
@@ -87,6 +104,10 @@ _SIGNATURES = {
     "tgb_raster_backward": (c_int32, [c_void_p, POINTER(Scene), POINTER(Gradients), POINTER(c_double)]),
     "tgb_raster_release": (None, [c_void_p]),
     "tgb_raster_counts": (None, [c_void_p, POINTER(c_int32)]),
+    "tgb_blend": (None, [c_void_p, c_void_p, c_int32, c_void_p, c_int32, c_int64, c_void_p, c_int32]),
+    "tgb_adam": (None, [*[c_void_p] * 5, c_int64, POINTER(AdamRates), c_int32]),
+    "tgb_blend_adam": (None, [POINTER(BlendState), POINTER(AdamRates), c_int32]),
+    "tgb_l1_dssim": (c_double, [c_void_p, c_void_p, c_int32, c_int32, c_float, c_float, c_void_p, c_int32]),
 }
 
 

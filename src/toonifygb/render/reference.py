@@ -1,9 +1,9 @@
 """The reference renderer: what every other renderer must reproduce, in plain torch.
 
-3D Gaussian splatting exactly as 3DGB's rasteriser does it: the tile rectangle of a Gaussian decides which pixels can
-meet it, the order is by float32 depth with ties in input order, a pixel stops *before* the Gaussian that would make
-it opaque, the clamp of opacity is ignored by the gradient, and a coordinate held at the frustum margin passes none.
-Any floating dtype; autograd differentiates it. Memory is bounded by recomputing each tile in the backward pass.
+3D Gaussian splatting exactly as 3DGB's rasteriser does it: the tile rectangle of a Gaussian decides which pixels
+can meet it, the order is by float32 depth with ties in input order, a pixel stops *before* the Gaussian that would
+make it opaque, the clamp of opacity is ignored by the gradient, and a coordinate held at the frustum margin passes
+none. Any floating dtype; autograd differentiates it. Memory is bounded by recomputing each tile in the backward pass.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ def _composite(projected: Projected, camera: Camera, constants: RasterConstants)
 
 
 def _record(info: RenderInfo, projected: Projected, color: Tensor, camera: Camera, n: int) -> Tensor:
-    """Fills ``info`` now with the radii, and when the returned copy of ``color`` is differentiated with the rest."""
+    """Fills ``info`` with the radii now, and with the rest when the returned copy of ``color`` is differentiated."""
     radii = torch.zeros(n, dtype=torch.int32, device=color.device)
     info.radii = radii.index_put((projected.index,), projected.radii.to(torch.int32))
     if not color.requires_grad:

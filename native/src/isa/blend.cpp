@@ -1,0 +1,159 @@
+// Blendshape evaluation and Adam. All of it is bound by memory traffic: every delta is read once per evaluation, and
+// read and written once with its two moments per step; the gradient of row k, psi_k g, is never stored.
+#include "kernels.h"
+
+namespace tgb {
+namespace TGB_ISA {
+namespace {
+
+constexpr int kSweep = 4096;    // parameters per blending task: they stay in the L1 cache while rows stream past
+constexpr int kAdamChunk = 8192;  // parameters per Adam task: gradient and rates stay in the L2 cache
+
+inline F load_delta(const float* p) { return load_unaligned(p); }
+inline F load_delta(const uint16_t* p) { return load_bf16(p); }
+inline float scalar_delta(float p) { return p; }
+inline float scalar_delta(uint16_t p) {
+  const uint32_t word = static_cast<uint32_t>(p) << 16;
+  float value;
+  memcpy(&value, &word, 4);
+  return value;
+}
+
+// out = source + w0 rows0 + ... for up to four rows in one pass over out.
+template <int N, class T>
+inline void add_rows(const float* source, const T* const* rows, const float* weights, float* out, int count) {
+  F w[N];
+  for (int r = 0; r < N; r++) w[r] = F(weights[r]);
+  int i = 0;
+  for (; i + kWidth <= count; i += kWidth) {
+    F sum = load_unaligned(source + i);
+    for (int r = 0; r < N; r++) sum = fma(w[r], load_delta(rows[r] + i), sum);
+    store_unaligned(out + i, sum);
+  }
+  for (; i < count; i++) {
+    float sum = source[i];
+    for (int r = 0; r < N; r++) sum = __builtin_fmaf(weights[r], scalar_delta(rows[r][i]), sum);
+    out[i] = sum;
+  }
+}
+
+template <class T>
+void blend_typed(const float* base, const T* deltas, const float* psi, int k, int64_t p, float* out, int threads) {
+  parallel_for(threads, static_cast<int>((p + kSweep - 1) / kSweep), [&](int task) {
+    const int64_t begin = static_cast<int64_t>(task) * kSweep;
+    const int count = static_cast<int>(p - begin < kSweep ? p - begin : kSweep);
+    const float* source = base + begin;
+    for (int row = 0; row < k;) {
+      const T* rows[4];
+      float weights[4];
+      int n = 0;
+      for (; row < k && n < 4; row++)
+        if (psi[row] != 0) rows[n] = deltas + row * p + begin, weights[n++] = psi[row];
+      switch (n) {
+        case 0: continue;
+        case 1: add_rows<1>(source, rows, weights, out + begin, count); break;
+        case 2: add_rows<2>(source, rows, weights, out + begin, count); break;
+        case 3: add_rows<3>(source, rows, weights, out + begin, count); break;
+        default: add_rows<4>(source, rows, weights, out + begin, count);
+      }
+      source = out + begin;
+    }
+    if (source != out + begin) memcpy(out + begin, base + begin, count * sizeof(float));
+  });
+}
+
+struct AdamFactors {
+  float beta1, rest1, beta2, rest2, eps, correct1, correct2;
+  explicit AdamFactors(const AdamRates& r) {
+    const double step = static_cast<double>(r.step);  // 1 - beta in double: 1 - 0.999f is off by 1e-5
+    beta1 = static_cast<float>(r.beta1), rest1 = static_cast<float>(1 - r.beta1);
+    beta2 = static_cast<float>(r.beta2), rest2 = static_cast<float>(1 - r.beta2);
+    eps = static_cast<float>(r.eps);
+    correct1 = static_cast<float>(1 / (1 - pow(r.beta1, step)));
+    correct2 = static_cast<float>(1 / sqrt(1 - pow(r.beta2, step)));
+  }
+};
+
+// One step on `count` parameters with gradient weight g.
+inline void adam_range(const AdamFactors& f, float weight, const float* g, const float* rate, float* p, float* m,
+                       float* v, int count) {
+  const F b1(f.beta1), n1(f.rest1), b2(f.beta2), n2(f.rest2), c1(f.correct1), c2(f.correct2), eps(f.eps);
+  const F w(weight);
+  int i = 0;
+  for (; i + kWidth <= count; i += kWidth) {
+    const F gradient = w * load_unaligned(g + i);
+    const F first = fma(b1, load_unaligned(m + i), n1 * gradient);
+    const F second = fma(b2, load_unaligned(v + i), n2 * gradient * gradient);
+    store_unaligned(m + i, first), store_unaligned(v + i, second);
+    const F step = load_unaligned(rate + i) * c1 * first / fma(vsqrt(second), c2, eps);
+    store_unaligned(p + i, load_unaligned(p + i) - step);
+  }
+  for (; i < count; i++) {
+    const float gradient = weight * g[i];
+    m[i] = f.beta1 * m[i] + f.rest1 * gradient;
+    v[i] = f.beta2 * v[i] + f.rest2 * gradient * gradient;
+    p[i] -= rate[i] * f.correct1 * m[i] / (sqrtf(v[i]) * f.correct2 + f.eps);
+  }
+}
+
+// Learning rates of row k for Gaussians [g0, g1) of a group; returns whether any is not zero.
+inline bool scaled_rates(const float* rates, const float* scale, int width, int g0, int g1, float* out) {
+  bool live = false;
+  for (int g = g0; g < g1; g++) {
+    const float s = scale[g];
+    live |= s != 0;
+    for (int j = 0; j < width; j++) *out++ = s * *rates++;
+  }
+  return live;
+}
+
+// Task `task` of group `width` wide, starting at parameter `offset`: some Gaussians, all rows.
+void blend_adam_task(const BlendState& s, const AdamFactors& f, int64_t offset, int width, int task, int per_task) {
+  const int g0 = task * per_task, g1 = imin(s.n, g0 + per_task), count = (g1 - g0) * width;
+  const int64_t begin = offset + static_cast<int64_t>(g0) * width;
+  float scaled[kAdamChunk];
+  for (int k = 0; k < s.k; k++) {
+    if (s.skip_inactive && s.psi[k] == 0) continue;
+    const float* rates = s.learning_rates + begin;
+    if (s.scale != nullptr) {
+      if (!scaled_rates(rates, s.scale + static_cast<int64_t>(k) * s.n, width, g0, g1, scaled)) continue;
+      rates = scaled;
+    }
+    const int64_t at = k * s.p + begin;
+    adam_range(f, s.psi[k], s.gradient + begin, rates, s.deltas + at, s.first_moment + at, s.second_moment + at, count);
+  }
+}
+
+}  // namespace
+
+void blend(const float* base, const void* deltas, bool bf16, const float* psi, int k, int64_t p, float* out,
+           int threads) {
+  if (bf16)
+    blend_typed(base, static_cast<const uint16_t*>(deltas), psi, k, p, out, threads);
+  else
+    blend_typed(base, static_cast<const float*>(deltas), psi, k, p, out, threads);
+}
+
+void adam(float* parameters, float* first, float* second, const float* gradient, const float* rates, int64_t p,
+          const AdamRates& adam_rates, int threads) {
+  const AdamFactors factors(adam_rates);
+  parallel_for(threads, static_cast<int>((p + kAdamChunk - 1) / kAdamChunk), [&](int task) {
+    const int64_t at = static_cast<int64_t>(task) * kAdamChunk;
+    const int count = static_cast<int>(p - at < kAdamChunk ? p - at : kAdamChunk);
+    adam_range(factors, 1.f, gradient + at, rates + at, parameters + at, first + at, second + at, count);
+  });
+}
+
+void blend_adam(const BlendState& state, const AdamRates& adam_rates, int threads) {
+  const AdamFactors factors(adam_rates);
+  int64_t offset = 0;
+  for (int group = 0; group < state.groups; group++) {
+    const int width = state.widths[group], per_task = kAdamChunk / width;
+    parallel_for(threads, (state.n + per_task - 1) / per_task,
+                 [&](int task) { blend_adam_task(state, factors, offset, width, task, per_task); });
+    offset += static_cast<int64_t>(width) * state.n;
+  }
+}
+
+}  // namespace TGB_ISA
+}  // namespace tgb

@@ -1,0 +1,32 @@
+// Data of the training kernels shared by their instruction sets and the C interface.
+#pragma once
+#include <cstddef>
+#include <cstdint>
+
+#include "buffer.h"
+
+namespace tgb {
+
+// Mirrored field by field in src/toonifygb/render/library.py.
+struct AdamRates {
+  double beta1, beta2, eps;
+  int64_t step;  // counts from 1
+};
+
+// Deltas [k, p], row by row, and what a step of Adam needs of them.
+struct BlendState {
+  float *deltas, *first_moment, *second_moment;
+  const float *psi, *gradient, *learning_rates;  // [k], [p], [p]
+  const float* scale;                            // [k, n] factor of the step per row and Gaussian, or null
+  const int32_t* widths;                         // floats per Gaussian of each parameter group; sum x n = p
+  int64_t p;
+  int32_t k, n, groups, skip_inactive;
+};
+
+// Kept between calls.
+struct SimilarityWork {
+  Buffer<float> derivatives, bands;
+  Buffer<double> row_sums;
+};
+
+}  // namespace tgb

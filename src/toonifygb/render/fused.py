@@ -1,0 +1,212 @@
+"""Fused pieces of a training step, and their definition in plain torch.
+
+Parameters live in one flat vector of p floats (everything of the neutral Gaussians, activations not yet applied);
+the deltas ΔB_k of the K expression blendshapes are a matrix of K such rows. One frame's gradient with respect to row
+k is ψ_k·g, g being the gradient of the blended vector, so a step needs g alone and never the K×p gradient.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+
+from toonifygb import metrics
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jaxtyping import Float
+    from torch import Tensor
+
+BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
+"""Adam's constants in 3DGS and 3DGB."""
+
+
+class Kernels(Protocol):
+    """What a training step computes besides rendering. Steps change their tensors in place."""
+
+    name: str
+
+    def blend(
+        self, base: Float[Tensor, " p"], deltas: Float[Tensor, "k p"], psi: Float[Tensor, " k"]
+    ) -> Float[Tensor, " p"]:
+        """B = B0 + Σ ψ_k ΔB_k (Eq. 2 of ToonifyGB); rows whose ψ_k is 0 are not read.
+
+        Args:
+            base: B0.
+            deltas: float32, or bfloat16 to halve the memory traffic.
+            psi: expression coefficients.
+        """
+        ...
+
+    def adam_step(
+        self,
+        parameters: Float[Tensor, " p"],
+        first_moment: Float[Tensor, " p"],
+        second_moment: Float[Tensor, " p"],
+        gradient: Float[Tensor, " p"],
+        learning_rates: Float[Tensor, " p"],
+        step: int,
+    ) -> None:
+        """One step of Adam with a learning rate per parameter.
+
+        Args:
+            parameters: changed in place, like both moments.
+            first_moment: running mean of the gradient.
+            second_moment: running mean of its square.
+            gradient: of the loss.
+            learning_rates: see ``learning_rates``.
+            step: number of this step, from 1.
+        """
+        ...
+
+    def blend_adam_step(
+        self,
+        deltas: Float[Tensor, "k p"],
+        first_moment: Float[Tensor, "k p"],
+        second_moment: Float[Tensor, "k p"],
+        psi: Float[Tensor, " k"],
+        gradient: Float[Tensor, " p"],
+        learning_rates: Float[Tensor, " p"],
+        step: int,
+        *,
+        scale: Float[Tensor, "k n"] | None = None,
+        widths: Sequence[int] = (),
+        skip_inactive: bool = False,
+    ) -> None:
+        """One step of Adam on all deltas with the gradient ψ_k·g of row k.
+
+        ``scale`` is 3DGB's blendshape consistency. There the trained tensor is Δ̂_k and the delta applied is
+        scale·Δ̂_k; here ``deltas`` are the applied ones. Adam does not feel a constant factor of its gradient (up to
+        eps), so its step on Δ̂_k is the plain step, and on the applied delta it is the plain step times scale.
+
+        Args:
+            deltas: ΔB_k, changed in place, like both moments.
+            first_moment: running mean of ψ_k·g.
+            second_moment: running mean of its square.
+            psi: expression coefficients of the frame.
+            gradient: g, with respect to the blended parameters.
+            learning_rates: per parameter.
+            step: number of this step, from 1.
+            scale: factor of the step per row and Gaussian; where it is 0 the delta stays as it is, and its moments
+                mean nothing.
+            widths: floats per Gaussian of each parameter group in the flat vector, in order; needed with ``scale``.
+            skip_inactive: leave rows with ψ_k = 0 as they are, moments included, instead of coasting on momentum.
+        """
+        ...
+
+    def l1_dssim(
+        self,
+        image: Float[Tensor, "h w 3"],
+        target: Float[Tensor, "h w 3"],
+        l1_weight: float = 0.8,
+        dssim_weight: float = 0.2,
+    ) -> tuple[Float[Tensor, ""], Float[Tensor, "h w 3"]]:
+        """l1_weight·mean|image − target| + dssim_weight·(1 − SSIM), and its gradient with respect to ``image``."""
+        ...
+
+
+def learning_rates(widths: Sequence[int], rates: Sequence[float | Sequence[float]], n: int) -> Float[Tensor, " p"]:
+    """Learning rate of every parameter of a flat vector of groups.
+
+    Args:
+        widths: floats per Gaussian of each group.
+        rates: one rate per group, or one per float of the group (SH: the DC trains faster than the rest).
+        n: number of Gaussians.
+    """
+    parts = []
+    for width, rate in zip(widths, rates, strict=True):
+        parts.append(torch.as_tensor(rate, dtype=torch.float32).expand(width).repeat(n))
+    return torch.cat(parts)
+
+
+def expand_scale(scale: Float[Tensor, "k n"], widths: Sequence[int]) -> Float[Tensor, "k p"]:
+    """Scale of every parameter from the scale of every Gaussian."""
+    return torch.cat([scale.repeat_interleave(width, dim=1) for width in widths], dim=1)
+
+
+def check_blend_step(deltas: Tensor, scale: Tensor | None, widths: Sequence[int]) -> None:
+    """Makes sure that groups and scale fill the rows of ``deltas``.
+
+    Raises:
+        ValueError: they do not.
+    """
+    if scale is None:
+        return
+    k, p = deltas.shape
+    if scale.shape[0] != k or scale.shape[1] * sum(widths) != p:
+        raise ValueError(
+            f"scale has shape {tuple(scale.shape)} and widths sum to {sum(widths)}, "
+            f"expected ({k}, n) with n · sum(widths) = {p}"
+        )
+
+
+class ReferenceKernels:
+    """The definition of every kernel, in plain torch and any floating dtype."""
+
+    name = "reference"
+
+    def blend(
+        self, base: Float[Tensor, " p"], deltas: Float[Tensor, "k p"], psi: Float[Tensor, " k"]
+    ) -> Float[Tensor, " p"]:
+        """See ``Kernels.blend``."""
+        active = psi.nonzero()[:, 0]
+        return base + psi[active] @ deltas[active].to(base.dtype)
+
+    def adam_step(
+        self,
+        parameters: Float[Tensor, " p"],
+        first_moment: Float[Tensor, " p"],
+        second_moment: Float[Tensor, " p"],
+        gradient: Float[Tensor, " p"],
+        learning_rates: Float[Tensor, " p"],
+        step: int,
+    ) -> None:
+        """See ``Kernels.adam_step``."""
+        first_moment.mul_(BETA1).add_((1 - BETA1) * gradient)
+        second_moment.mul_(BETA2).add_((1 - BETA2) * gradient * gradient)
+        mean, square = first_moment / (1 - BETA1**step), second_moment / (1 - BETA2**step)
+        parameters.sub_(learning_rates * mean / (square.sqrt() + EPS))
+
+    def blend_adam_step(
+        self,
+        deltas: Float[Tensor, "k p"],
+        first_moment: Float[Tensor, "k p"],
+        second_moment: Float[Tensor, "k p"],
+        psi: Float[Tensor, " k"],
+        gradient: Float[Tensor, " p"],
+        learning_rates: Float[Tensor, " p"],
+        step: int,
+        *,
+        scale: Float[Tensor, "k n"] | None = None,
+        widths: Sequence[int] = (),
+        skip_inactive: bool = False,
+    ) -> None:
+        """See ``Kernels.blend_adam_step``."""
+        check_blend_step(deltas, scale, widths)
+        for k in range(len(deltas)):
+            if skip_inactive and psi[k] == 0:
+                continue
+            rates = learning_rates if scale is None else learning_rates * expand_scale(scale[k : k + 1], widths)[0]
+            state = (deltas[k], first_moment[k], second_moment[k])
+            live = slice(None) if scale is None else rates != 0
+            parts = [row[live] for row in state]  # views without a scale, copies with one
+            self.adam_step(*parts, psi[k] * gradient[live], rates[live], step)
+            for row, part in zip(state, parts, strict=True):
+                row[live] = part
+
+    def l1_dssim(
+        self,
+        image: Float[Tensor, "h w 3"],
+        target: Float[Tensor, "h w 3"],
+        l1_weight: float = 0.8,
+        dssim_weight: float = 0.2,
+    ) -> tuple[Float[Tensor, ""], Float[Tensor, "h w 3"]]:
+        """See ``Kernels.l1_dssim``."""
+        with torch.enable_grad():
+            variable = image.detach().requires_grad_()
+            l1 = (variable - target).abs().mean()
+            loss = l1_weight * l1 + dssim_weight * (1 - metrics.ssim(variable, target))
+            (gradient,) = torch.autograd.grad(loss, variable)
+        return loss.detach(), gradient

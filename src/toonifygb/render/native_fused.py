@@ -1,0 +1,153 @@
+"""The fused training kernels of the native engine: float32, on the CPU, in place where the definition is."""
+
+from __future__ import annotations
+
+from ctypes import addressof, c_int32
+from typing import TYPE_CHECKING
+
+import torch
+
+from toonifygb.render import library
+from toonifygb.render.fused import BETA1, BETA2, EPS, check_blend_step
+from toonifygb.render.native import available_threads
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jaxtyping import Float
+    from torch import Tensor
+
+
+def _address(tensor: Tensor, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> int:
+    """Address of a tensor that the engine can use as it is.
+
+    Raises:
+        ValueError: it has another shape, dtype, device or memory layout.
+    """
+    usable = tensor.dtype == dtype and tensor.device.type == "cpu" and tensor.is_contiguous()
+    if not usable or tuple(tensor.shape) != shape:
+        found = f"{tensor.dtype} {tuple(tensor.shape)} on {tensor.device}"
+        raise ValueError(f"{name} is {found}, expected contiguous {dtype} {shape} on cpu")
+    return tensor.data_ptr()
+
+
+def _rates(step: int) -> library.AdamRates:
+    return library.AdamRates(beta1=BETA1, beta2=BETA2, eps=EPS, step=step)
+
+
+class NativeKernels:
+    """See ``toonifygb.render.fused.Kernels``.
+
+    Args:
+        threads: threads of the engine; all available processors when ``None``.
+
+    Raises:
+        BackendError: the engine is not built or cannot be loaded.
+    """
+
+    name = "native"
+
+    def __init__(self, threads: int | None = None) -> None:
+        self._engine = library.load()
+        self.threads = threads or available_threads()
+
+    def blend(
+        self, base: Float[Tensor, " p"], deltas: Float[Tensor, "k p"], psi: Float[Tensor, " k"]
+    ) -> Float[Tensor, " p"]:
+        """See ``Kernels.blend``."""
+        k, p = deltas.shape
+        half = deltas.dtype == torch.bfloat16
+        out = torch.empty(p)
+        self._engine.tgb_blend(
+            _address(base, "base", (p,)),
+            _address(deltas, "deltas", (k, p), torch.bfloat16 if half else torch.float32),
+            half,
+            _address(psi, "psi", (k,)),
+            k,
+            p,
+            out.data_ptr(),
+            self.threads,
+        )
+        return out
+
+    def adam_step(
+        self,
+        parameters: Float[Tensor, " p"],
+        first_moment: Float[Tensor, " p"],
+        second_moment: Float[Tensor, " p"],
+        gradient: Float[Tensor, " p"],
+        learning_rates: Float[Tensor, " p"],
+        step: int,
+    ) -> None:
+        """See ``Kernels.adam_step``."""
+        shape = (parameters.numel(),)
+        self._engine.tgb_adam(
+            _address(parameters, "parameters", shape),
+            _address(first_moment, "first_moment", shape),
+            _address(second_moment, "second_moment", shape),
+            _address(gradient, "gradient", shape),
+            _address(learning_rates, "learning_rates", shape),
+            parameters.numel(),
+            _rates(step),
+            self.threads,
+        )
+
+    def blend_adam_step(
+        self,
+        deltas: Float[Tensor, "k p"],
+        first_moment: Float[Tensor, "k p"],
+        second_moment: Float[Tensor, "k p"],
+        psi: Float[Tensor, " k"],
+        gradient: Float[Tensor, " p"],
+        learning_rates: Float[Tensor, " p"],
+        step: int,
+        *,
+        scale: Float[Tensor, "k n"] | None = None,
+        widths: Sequence[int] = (),
+        skip_inactive: bool = False,
+    ) -> None:
+        """See ``Kernels.blend_adam_step``."""
+        check_blend_step(deltas, scale, widths)
+        k, p = deltas.shape
+        n = p if scale is None else scale.shape[1]
+        groups = (1,) if scale is None else tuple(widths)
+        group_widths = (c_int32 * len(groups))(*groups)
+        state = library.BlendState(
+            deltas=_address(deltas, "deltas", (k, p)),
+            first_moment=_address(first_moment, "first_moment", (k, p)),
+            second_moment=_address(second_moment, "second_moment", (k, p)),
+            psi=_address(psi, "psi", (k,)),
+            gradient=_address(gradient, "gradient", (p,)),
+            learning_rates=_address(learning_rates, "learning_rates", (p,)),
+            scale=None if scale is None else _address(scale, "scale", (k, n)),
+            widths=addressof(group_widths),
+            p=p,
+            k=k,
+            n=n,
+            groups=len(groups),
+            skip_inactive=skip_inactive,
+        )
+        self._engine.tgb_blend_adam(state, _rates(step), self.threads)
+
+    def l1_dssim(
+        self,
+        image: Float[Tensor, "h w 3"],
+        target: Float[Tensor, "h w 3"],
+        l1_weight: float = 0.8,
+        dssim_weight: float = 0.2,
+    ) -> tuple[Float[Tensor, ""], Float[Tensor, "h w 3"]]:
+        """See ``Kernels.l1_dssim``."""
+        image, target = (tensor.detach().to("cpu", torch.float32).contiguous() for tensor in (image, target))
+        height, width, _ = shape = tuple(image.shape)
+        gradient = torch.empty_like(image)
+        loss = self._engine.tgb_l1_dssim(
+            _address(image, "image", (height, width, 3)),
+            _address(target, "target", shape),
+            height,
+            width,
+            l1_weight,
+            dssim_weight,
+            gradient.data_ptr(),
+            self.threads,
+        )
+        return torch.tensor(loss, dtype=torch.float32), gradient
