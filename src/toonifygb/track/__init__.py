@@ -1,6 +1,24 @@
 """Explaining a clip's landmarks by a head model."""
 
+from toonifygb.track import overlay
 from toonifygb.track.files import load, save
 from toonifygb.track.fitting import fit
+from toonifygb.track.regions import Boxes, HeadRegion, head_boxes, head_region
+from toonifygb.track.source import Choice, choose_source
+from toonifygb.track.steadiness import Report, jitter_px, report
 
-__all__ = ["fit", "load", "save"]
+__all__ = [
+    "Boxes",
+    "Choice",
+    "HeadRegion",
+    "Report",
+    "choose_source",
+    "fit",
+    "head_boxes",
+    "head_region",
+    "jitter_px",
+    "load",
+    "overlay",
+    "report",
+    "save",
+]
