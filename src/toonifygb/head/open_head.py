@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 SHA256 = "44b413b20d1b8bd0cbc945a2e56dee103d5f36a198d6153918a3fd699dd0fb74"
 """Of the shipped file; the builder prints the same."""
+FACE_MODES = 72
+"""The first so many identity coefficients explain the face, ears and skull following by regression; the others
+move only ears, skull and neck. A fit to landmarks leaves those at zero."""
 
 
 def load_open_head() -> HeadModel:
