@@ -94,9 +94,12 @@ void colour_backward(const View& view, const Frame& frame, const Scene& scene, c
   for (int lane = 0; lane < count; lane++) {
     const size_t at = static_cast<size_t>(i + lane) * stored * 3;
     const float* sh = splats.sh + at;
-    float v[3] = {0, 0, 0}, *out = gradients.sh + at;
-    if (frame.drawn[i + lane])
-      for (int c = 0; c < 3; c++) v[c] = frame.clamped[i + lane] >> c & 1 ? 0 : rgb[c][lane];
+    float v[3], *out = gradients.sh + at;
+    if (!frame.drawn[i + lane]) {
+      memset(out, 0, 3 * sizeof(float) * stored);
+      continue;
+    }
+    for (int c = 0; c < 3; c++) v[c] = frame.clamped[i + lane] >> c & 1 ? 0 : rgb[c][lane];
     for (int k = 0; k < used; k++) {
       for (int c = 0; c < 3; c++) out[3 * k + c] = b[k][lane] * v[c];
       w[k][lane] = v[0] * sh[3 * k] + v[1] * sh[3 * k + 1] + v[2] * sh[3 * k + 2];

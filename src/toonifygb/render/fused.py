@@ -1,8 +1,8 @@
 """Fused pieces of a training step, and their definition in plain torch.
 
 Parameters live in one flat vector of p floats (everything of the neutral Gaussians, activations not yet applied);
-the deltas ΔB_k of the K expression blendshapes are a matrix of K such rows. One frame's gradient with respect to row
-k is ψ_k·g, g being the gradient of the blended vector, so a step needs g alone and never the K×p gradient.
+the deltas ΔB_k of the K expression blendshapes are a matrix of K such rows. One frame's gradient with respect to
+row k is ψ_k·g, g being the gradient of the blended vector, so a step needs g alone and never the K×p gradient.
 """
 
 from __future__ import annotations
@@ -188,13 +188,14 @@ class ReferenceKernels:
         for k in range(len(deltas)):
             if skip_inactive and psi[k] == 0:
                 continue
-            rates = learning_rates if scale is None else learning_rates * expand_scale(scale[k : k + 1], widths)[0]
-            state = (deltas[k], first_moment[k], second_moment[k])
-            live = slice(None) if scale is None else rates != 0
-            parts = [row[live] for row in state]  # views without a scale, copies with one
-            self.adam_step(*parts, psi[k] * gradient[live], rates[live], step)
-            for row, part in zip(state, parts, strict=True):
-                row[live] = part
+            if scale is None:
+                live, rates = torch.ones_like(learning_rates, dtype=torch.bool), learning_rates
+            else:
+                rates = learning_rates * expand_scale(scale[k : k + 1], widths)[0]
+                live = rates != 0
+            delta, first, second = deltas[k][live], first_moment[k][live], second_moment[k][live]
+            self.adam_step(delta, first, second, psi[k] * gradient[live], rates[live], step)
+            deltas[k, live], first_moment[k, live], second_moment[k, live] = delta, first, second
 
     def l1_dssim(
         self,

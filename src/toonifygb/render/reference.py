@@ -3,11 +3,12 @@
 3D Gaussian splatting exactly as 3DGB's rasteriser does it: the tile rectangle of a Gaussian decides which pixels
 can meet it, the order is by float32 depth with ties in input order, a pixel stops *before* the Gaussian that would
 make it opaque, the clamp of opacity is ignored by the gradient, and a coordinate held at the frustum margin passes
-none. Any floating dtype; autograd differentiates it. Memory is bounded by recomputing each tile in the backward pass.
+none. Any floating dtype; autograd differentiates it. Memory is bounded by recomputing tiles in the backward pass.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -90,7 +91,7 @@ def _candidates(splats: Splats, camera: Camera, constants: RasterConstants) -> I
         keep = splats.means @ row[:3] + row[3] > constants.near
         for field in (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh, splats.sh_frames):
             if field is not None:
-                keep &= field.reshape(len(field), -1).isfinite().all(-1)
+                keep &= field.isfinite().reshape(len(field), math.prod(field.shape[1:])).all(-1)
         return keep.nonzero()[:, 0]
 
 
@@ -192,7 +193,7 @@ def _composite(projected: Projected, camera: Camera, constants: RasterConstants)
 
 
 def _record(info: RenderInfo, projected: Projected, color: Tensor, camera: Camera, n: int) -> Tensor:
-    """Fills ``info`` with the radii now, and with the rest when the returned copy of ``color`` is differentiated."""
+    """Fills ``info`` with the radii now, and with the rest when the returned ``color`` is differentiated."""
     radii = torch.zeros(n, dtype=torch.int32, device=color.device)
     info.radii = radii.index_put((projected.index,), projected.radii.to(torch.int32))
     if not color.requires_grad:

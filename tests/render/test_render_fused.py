@@ -1,0 +1,172 @@
+"""The fused training kernels: their definition against torch, and the native ones against the definition."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from toonifygb import metrics, render
+from toonifygb.render.fused import Kernels, ReferenceKernels, expand_scale, learning_rates
+
+WIDTHS, N, K = (3, 4, 3, 1, 12), 1003, 7  # 1003: neither vectors nor chunks come out even
+P = N * sum(WIDTHS)
+DEFINITION = ReferenceKernels()
+
+
+@pytest.fixture(params=["reference", "native"])
+def kernels(request: pytest.FixtureRequest) -> Kernels:
+    """Each set of kernels in turn."""
+    if request.param == "native":
+        return request.getfixturevalue("native_kernels")
+    return render.kernels("reference")
+
+
+@pytest.fixture
+def rates() -> Tensor:
+    """Learning rates that differ between groups, and within the last."""
+    return learning_rates(WIDTHS, (1e-3, 2e-3, 3e-3, 4e-3, [2e-3] * 3 + [1e-4] * 9), N)
+
+
+def coefficients() -> Tensor:
+    """Expression coefficients, some of them 0."""
+    return torch.randn(K) * (torch.arange(K) % 3 != 1)
+
+
+def doubles(tensors: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """Copies in float64."""
+    return tuple(tensor.detach().to(torch.float64, copy=True) for tensor in tensors)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("p", [1, 15, P])
+def test_blend_is_the_weighted_sum(kernels: Kernels, dtype: torch.dtype, p: int) -> None:
+    base, deltas, psi = torch.randn(p), torch.randn(K, p).to(dtype), coefficients()
+    expected = base.double() + (psi.double()[:, None] * deltas.double()).sum(0)
+    torch.testing.assert_close(kernels.blend(base, deltas, psi).double(), expected, rtol=0, atol=5e-6)
+    assert torch.equal(kernels.blend(base, deltas, torch.zeros(K)), base)
+
+
+def test_blend_does_not_read_inactive_rows(kernels: Kernels) -> None:
+    deltas, psi = torch.full((K, 50), torch.nan), torch.zeros(K)
+    deltas[3], psi[3] = 1.0, 0.5
+    assert torch.equal(kernels.blend(torch.zeros(50), deltas, psi), torch.full((50,), 0.5))
+
+
+def test_adam_step_is_torch_adam(kernels: Kernels) -> None:
+    dtype = torch.float64 if kernels.name == "reference" else torch.float32
+    ours = torch.randn(999, dtype=dtype)
+    theirs = ours.to(torch.float64, copy=True).requires_grad_()
+    optimizer = torch.optim.Adam([theirs], lr=1e-2, betas=(0.9, 0.999), eps=1e-15)
+    state = (ours, torch.zeros_like(ours), torch.zeros_like(ours))
+    for step in range(1, 8):
+        gradient = torch.randn(999, dtype=dtype) * torch.logspace(-6, 3, 999, dtype=dtype)
+        theirs.grad = gradient.double()
+        optimizer.step()
+        kernels.adam_step(*state, gradient, torch.full((999,), 1e-2, dtype=dtype), step)
+    torch.testing.assert_close(
+        ours.double(), theirs.detach(), rtol=0, atol=1e-12 if dtype == torch.float64 else 2e-6
+    )
+
+
+def test_adam_step_leaves_parameters_without_gradient(kernels: Kernels) -> None:
+    parameters = torch.randn(40)
+    before = parameters.clone()
+    kernels.adam_step(parameters, torch.zeros(40), torch.zeros(40), torch.zeros(40), torch.ones(40), 1)
+    assert torch.equal(parameters, before)
+
+
+def test_consistency_scale_is_adam_on_the_unscaled_deltas(rates: Tensor) -> None:
+    """Steps on applied deltas scale·Δ̂ equal Adam's steps on the trained tensor Δ̂ (3DGB's intermediate variable)."""
+    scale = torch.rand(K, N, dtype=torch.float64) + 0.1
+    factor = expand_scale(scale, WIDTHS)
+    hidden = torch.zeros(K, P, dtype=torch.float64, requires_grad=True)
+    applied = [torch.zeros(K, P, dtype=torch.float64) for _ in range(3)]
+    optimizer = torch.optim.Adam([hidden], lr=1.0, eps=1e-15)
+    for step in range(1, 4):
+        psi, gradient = coefficients().double() + 0.1, torch.randn(P, dtype=torch.float64)
+        hidden.grad = factor * psi[:, None] * gradient
+        optimizer.step()
+        DEFINITION.blend_adam_step(
+            *applied, psi, gradient, torch.ones(P, dtype=torch.float64), step, scale=scale, widths=WIDTHS
+        )
+    torch.testing.assert_close(applied[0], factor * hidden.detach(), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("scaled", [False, True])
+@pytest.mark.parametrize("skip_inactive", [False, True])
+def test_native_blend_adam_agrees(
+    native_kernels: Kernels, rates: Tensor, scaled: bool, skip_inactive: bool
+) -> None:
+    scale = torch.rand(K, N) * (torch.rand(K, N) > 0.4) if scaled else None
+    live = torch.ones(K, P, dtype=torch.bool) if scale is None else expand_scale(scale, WIDTHS) != 0
+    found = (torch.randn(K, P), torch.zeros(K, P), torch.zeros(K, P))
+    start = found[0].clone()
+    expected = doubles(found)
+    for step in range(1, 6):
+        psi, gradient = coefficients().roll(step), torch.randn(P)
+        options = {"widths": WIDTHS, "skip_inactive": skip_inactive}
+        native_kernels.blend_adam_step(*found, psi, gradient, rates, step, scale=scale, **options)
+        wide_scale = None if scale is None else scale.double()
+        DEFINITION.blend_adam_step(*expected, *doubles((psi, gradient, rates)), step, scale=wide_scale, **options)
+    for ours, definition in zip(found, expected, strict=True):
+        torch.testing.assert_close(ours.double()[live], definition[live], rtol=1e-5, atol=1e-6)
+    assert torch.equal(found[0][~live], start[~live])
+    assert (found[0] - start)[live].abs().max() > 1e-3
+
+
+def test_inactive_rows_coast_unless_skipped(kernels: Kernels, rates: Tensor) -> None:
+    moved = {}
+    for skip_inactive in (False, True):
+        state = (torch.zeros(K, P), torch.zeros(K, P), torch.zeros(K, P))
+        gradient, psi = torch.randn(P), torch.ones(K)
+        kernels.blend_adam_step(*state, psi, gradient, rates, 1, skip_inactive=skip_inactive)
+        before, psi[2] = state[0].clone(), 0
+        kernels.blend_adam_step(*state, psi, gradient, rates, 2, skip_inactive=skip_inactive)
+        moved[skip_inactive] = (state[0] - before)[2].abs().max().item()
+    assert moved[True] == 0 < moved[False]
+
+
+@pytest.mark.parametrize("size", [(1, 1), (5, 3), (11, 11), (33, 17), (64, 96)])
+def test_l1_dssim_agrees_with_its_definition(kernels: Kernels, size: tuple[int, int]) -> None:
+    image, target = torch.rand(*size, 3), torch.rand(*size, 3)
+    target[: size[0] // 2] = image[: size[0] // 2]  # no difference: the subgradient of |x| is 0
+    loss, gradient = kernels.l1_dssim(image, target, 0.7, 0.4)
+    variable = image.double().requires_grad_()
+    expected = 0.7 * (variable - target).abs().mean() + 0.4 * (1 - metrics.ssim(variable, target.double()))
+    (slope,) = torch.autograd.grad(expected, variable)
+    assert loss.item() == pytest.approx(expected.item(), abs=1e-6)
+    # 2e-6: variances are differences of squares in float32
+    torch.testing.assert_close(gradient.double(), slope, rtol=0, atol=2e-6 * slope.abs().max().item())
+
+
+def test_threads_do_not_change_a_bit(native_kernels: Kernels, rates: Tensor) -> None:
+    many = render.kernels("native", threads=3)
+    results = []
+    for kernels in (native_kernels, many):
+        random = torch.Generator().manual_seed(3)
+        state = tuple(torch.rand(K, P, generator=random) for _ in range(3))
+        base, psi = torch.randn(P, generator=random), torch.randn(K, generator=random)
+        image, target = torch.rand(2, 70, 45, 3, generator=random)
+        blended = kernels.blend(base, state[0], psi)
+        kernels.blend_adam_step(
+            *state, psi, base, rates, 4, scale=torch.rand(K, N, generator=random), widths=WIDTHS
+        )
+        kernels.adam_step(*(row[0] for row in state), base, rates, 4)
+        results.append([blended, *state, *kernels.l1_dssim(image, target)])
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_unusable_tensors_are_named(native_kernels: Kernels) -> None:
+    with pytest.raises(ValueError, match=r"base is torch.float64 \(4,\) on cpu, expected contiguous torch.float32"):
+        native_kernels.blend(torch.zeros(4, dtype=torch.float64), torch.zeros(2, 4), torch.zeros(2))
+    with pytest.raises(ValueError, match="psi is"):
+        native_kernels.blend(torch.zeros(4), torch.zeros(2, 4), torch.zeros(3))
+
+
+def test_scale_must_fit(kernels: Kernels) -> None:
+    state = tuple(torch.zeros(2, 8) for _ in range(3))
+    with pytest.raises(ValueError, match=r"expected \(2, n\) with n"):
+        kernels.blend_adam_step(
+            *state, torch.ones(2), torch.ones(8), torch.ones(8), 1, scale=torch.ones(2, 3), widths=(1, 3)
+        )
