@@ -212,23 +212,30 @@ def test_full_disk_is_one_sentence(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_8k_is_streamed_in_bounded_memory(tmp_path: Path):
-    """Twenty 8K frames are 2 GB as RGB; writing and reading them must not hold them all."""
+def test_4k_is_streamed_in_bounded_memory(tmp_path: Path):
+    """Sixty 4K frames are 1.5 GB as RGB and 0.75 GB coded raw; writing and reading hold a fixed few of them."""
     script = f"""
         import resource
         import numpy as np
         from toonifygb.video import Writer, read
-        base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        frame = np.zeros((4320, 7680, 3), np.uint8)
-        with Writer({str(tmp_path / "big.mp4")!r}, 7680, 4320, 25) as writer:
-            for i in range(20):
-                frame[:, i * 300 : i * 300 + 300] = 10 * i
+        frame = np.zeros((2160, 3840, 3), np.uint8)
+        def peak():
+            return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+        with Writer({str(tmp_path / "big.mp4")!r}, 3840, 2160, 25) as writer:
+            for i in range(60):
+                if i == 30:
+                    half_way = peak()
+                frame[:, i * 60 : i * 60 + 60] = 4 * i
                 writer.write(frame)
-        assert sum(image.shape == (4320, 7680, 3) for image in read({str(tmp_path / "big.mp4")!r})) == 20
-        print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - base) // 1024)
+        written = peak()
+        assert sum(image.shape == (2160, 3840, 3) for image in read({str(tmp_path / "big.mp4")!r})) == 60
+        print(half_way, written, peak())
     """
     result = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=False
     )
     assert result.returncode == 0, result.stderr
-    assert int(result.stdout) < 1800, f"{result.stdout} MB"
+    half_way, written, read = map(int, result.stdout.split())
+    # Once the encoder's lookahead is full, after some 21 frames, nothing grows any more; thirty frames are 370 MB
+    # at least. The decoder's own few come on top of what the encoder's left fragmented.
+    assert written - half_way < 150 and read - written < 300, result.stdout
