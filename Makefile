@@ -4,17 +4,25 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
+INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
+SOURCES := pyproject.toml constraints.txt native/CMakeLists.txt $(shell find native/src -type f)
+
 .PHONY: setup demo test check bench clean
 
-setup: $(STAMP)
+setup: $(VENV)/.installed-dev
 
-$(STAMP): pyproject.toml constraints.txt native/CMakeLists.txt $(wildcard native/src/*)
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.installed: $(SOURCES) | $(BIN)/python
+	$(INSTALL) .
 	touch $@
 
-demo: setup
+$(VENV)/.installed-dev: $(VENV)/.installed
+	$(INSTALL) '.[dev]'
+	touch $@
+
+demo: $(VENV)/.installed
 	$(BIN)/toonifygb demo --out runs/demo
 
 test: setup

@@ -6,6 +6,7 @@ import difflib
 import errno
 import inspect
 import logging
+import os
 import sys
 
 from toonifygb import __version__
@@ -37,11 +38,11 @@ def run(argv: list[str]) -> int:
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     name = argv[0] if argv else "--help"
-    if name in ("-h", "--help", "--version"):
-        print(__version__ if name == "--version" else _overview())
-        return 0
     try:
-        _command(name, argv[1:])
+        if name in ("-h", "--help", "--version"):
+            print(__version__ if name == "--version" else _overview())
+        else:
+            _command(name, argv[1:])
     except ToonifyError as error:
         return _fail(error)
     except Stopped:
@@ -50,6 +51,9 @@ def run(argv: list[str]) -> int:
     except KeyboardInterrupt:
         print("\ninterrupted; the same command goes on from the last finished piece", file=sys.stderr)
         return EXIT_STOPPED
+    except BrokenPipeError:  # the reader of our output, `head` for instance, has seen enough
+        sys.stdout = open(os.devnull, "w")
+        return 0
     except OSError as error:
         if error.errno not in _DISK:
             raise

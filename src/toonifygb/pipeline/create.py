@@ -213,7 +213,7 @@ def fit_track(source: Source, run: Run, config: RunConfig, chosen: str) -> str:
         ) as writer:
             for index, frame in enumerate(video.read(run.file("stylized.mp4"), max_frames=sequence.n_frames)):
                 cropped = frame[: source.info.height, : source.info.width]
-                writer.write(track.draw(cropped, sequence, index, model))
+                writer.write(track.overlay.draw(cropped, sequence, index, model))
                 progress.update(index + 1, sequence.n_frames)
         track.save(sequence, out)
 
@@ -273,15 +273,16 @@ def head_frames(
         frame uint8 ``(h, w, 3)`` and matte float32 ``(h, w)``.
     """
     segmenter = face.PersonSegmenter()
-    boxes = track.head_boxes(sequence, model)
+    boxes = track.head_boxes(sequence, model).face.numpy()
+    region = track.HeadRegion(sequence, model)
     pairs = enumerate(zip(original, styled, strict=False))
     while chunk := list(itertools.islice(pairs, _CHUNK)):
         indices = [index for index, _ in chunk]
         photos = np.stack([photo for _, (photo, _) in chunk])
         persons = segmenter.segment(photos, boxes=boxes[indices])
         for (index, (photo, frame)), person in zip(chunk, persons, strict=True):
-            region = track.head_region(sequence, index, model)
-            yield frame, face.head_matte(photo, person, region)
+            matte = face.head_matte(photo, person, region(index).numpy())
+            yield face.foreground(frame, matte), matte
 
 
 def train_avatar(run: Run, config: RunConfig, cut: str, tracked: str) -> str:

@@ -1,6 +1,7 @@
 """Frames in, frames out, streaming. The only room that imports av."""
 
 from toonifygb.video.checksum import source_sha256
+from toonifygb.video.encoder import has_encoder
 from toonifygb.video.read import Clip, open_clip, probe, read
 from toonifygb.video.still import encode_jpeg, load_image, save_png
 from toonifygb.video.write import Writer
@@ -9,6 +10,7 @@ __all__ = [
     "Clip",
     "Writer",
     "encode_jpeg",
+    "has_encoder",
     "load_image",
     "open_clip",
     "probe",
