@@ -143,26 +143,53 @@ def face_widths(points: Float[np.ndarray, "t 478 2"]) -> Float[np.ndarray, " t"]
     return np.sqrt(area * 0.9)
 
 
-def mask(shape: tuple[int, int], polygons: list[Points], feather_px: float) -> Plane:
-    """Soft mask of polygons given in px: drawn with sub-pixel corners, then feathered."""
-    plane = np.zeros(shape, np.uint8)
-    for polygon in polygons:
-        fill(plane, polygon)
-    return blur(plane.astype(np.float32) * np.float32(1 / 255), feather_px)
+def box_around(points: Points, margin_px: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of the picture that hold ``points`` with a margin; empty when they lie outside."""
+    low = np.floor(points.min(0) - margin_px).astype(int)
+    high = np.ceil(points.max(0) + margin_px).astype(int)
+    left, top = np.clip(low, 0, [shape[1], shape[0]])
+    right, bottom = np.clip(high, 0, [shape[1], shape[0]])
+    return slice(int(top), int(bottom)), slice(int(left), int(right))
 
 
-def fill(plane: np.ndarray, polygon: Points, shift: int = 4) -> None:
-    """Draws a filled anti-aliased polygon given in continuous px into a uint8 plane."""
-    corners = np.rint((polygon - 0.5) * (1 << shift)).astype(np.int32)  # cv2 counts from pixel centres
-    cv2.fillPoly(plane, [corners], 255, cv2.LINE_AA, shift)
+def is_empty(box: tuple[slice, slice]) -> bool:
+    """Whether the box holds no pixel."""
+    return box[0].start >= box[0].stop or box[1].start >= box[1].stop
 
 
-def ribbon(shape: tuple[int, int], line: Points, width_px: float, feather_px: float) -> Plane:
-    """Soft mask along an open line given in px."""
-    plane = np.zeros(shape, np.uint8)
-    corners = np.rint((line - 0.5) * 16).astype(np.int32)
-    cv2.polylines(plane, [corners], False, 255, max(1, round(width_px)), cv2.LINE_AA, 4)
-    return blur(plane.astype(np.float32) * np.float32(1 / 255), feather_px)
+def in_box(points: Points, box: tuple[slice, slice]) -> Points:
+    """Positions counted from the corner of the box."""
+    return points - np.array([box[1].start, box[0].start], points.dtype)
+
+
+def mask(shape: tuple[int, int], shapes: list[Points], feather_px: float, line_px: float = 0.0) -> Plane:
+    """Soft mask of polygons, or of open lines, given in px.
+
+    Args:
+        shape: height and width.
+        shapes: corners of each; drawn with sub-pixel precision.
+        feather_px: standard deviation of the blur that softens them.
+        line_px: width of the lines; 0 fills the shapes as polygons.
+    """
+    plane = np.zeros(shape, np.float32)
+    # beyond three standard deviations and half a line the mask is 0; blurring the box alone saves most of the work
+    box = box_around(np.concatenate(shapes), 3.0 * feather_px + line_px + 2.0, shape)
+    if is_empty(box):
+        return plane
+    drawn = np.zeros((box[0].stop - box[0].start, box[1].stop - box[1].start), np.uint8)
+    for corners in shapes:
+        draw(drawn, in_box(corners, box), line_px)
+    plane[box] = blur(drawn.astype(np.float32) * np.float32(1 / 255), feather_px)
+    return plane
+
+
+def draw(plane: np.ndarray, corners: Points, line_px: float = 0.0, shift: int = 4) -> None:
+    """Draws an anti-aliased polygon, or an open line of some width, given in px into a uint8 plane."""
+    fixed = np.rint((corners - 0.5) * (1 << shift)).astype(np.int32)  # cv2 counts from pixel centres
+    if line_px > 0:
+        cv2.polylines(plane, [fixed], False, 255, max(1, round(line_px)), cv2.LINE_AA, shift)
+    else:
+        cv2.fillPoly(plane, [fixed], 255, cv2.LINE_AA, shift)
 
 
 def outline_of_eye(points: Points, eye: Eye) -> Points:
@@ -228,6 +255,5 @@ def frontal(faces: Faces) -> Float[np.ndarray, "478 2"]:
 
 def anatomy(shape: tuple[int, int], points: Points, unit: float) -> Plane:
     """Where a draughtsman looks for lines even if the picture shows them faintly: jaw and nose; 0..1.5."""
-    jaw = ribbon(shape, points[list(JAW_LINE)], 0.05 * unit, 0.02 * unit)
-    nose = ribbon(shape, points[list(NOSE_BASE)], 0.05 * unit, 0.02 * unit)
-    return 1.5 * np.maximum(jaw, nose)
+    lines = [points[list(JAW_LINE)], points[list(NOSE_BASE)]]
+    return np.float32(1.5) * mask(shape, lines, 0.02 * unit, 0.05 * unit)

@@ -1,7 +1,7 @@
 """Caricature by landmarks: larger eyes and a slimmer chin, as a smooth warp of the picture.
 
-The warp is a function of the landmarks alone. ``sources`` says where in the input each output position looks;
-``move_points`` inverts it for landmarks, so that whatever was found in the input can be carried to the output.
+The warp is a function of the landmarks alone. ``offsets`` says where in the input each output position looks;
+``move_points`` inverts it, so that whatever was found in the input can be carried to the output.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from toonifygb.stylize.anchors import EYES, Eye, face_widths
+from toonifygb.stylize.anchors import EYES, Eye, box_around, face_widths, is_empty
 from toonifygb.stylize.filters import sample, smoothstep
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 JAWS = ((172, 136, 150), (397, 365, 379))
 CHIN, FOREHEAD = 152, 10
+JAW_SIGMA = 0.2
+"""Standard deviation of the jaw's region in face widths."""
 INVERSION_STEPS = 12
 """Fixed-point steps; each at least halves the error, so 100 px shrink below 0.03 px."""
 
@@ -47,21 +49,51 @@ class Exaggeration:
 
 @dataclass(frozen=True)
 class _Bump:
-    """A soft elliptical region of the picture, in px."""
+    """A soft elliptical region, px, and what happens in it."""
 
     centre: Float[np.ndarray, " 2"]
-    radii: Float[np.ndarray, " 2"]
-    axis: Float[np.ndarray, " 2"]
-    """Unit direction of the first radius."""
+    axes: Float[np.ndarray, "2 2"]
+    """Rows: the directions of the radii, each divided by its radius."""
+    reach: float
+    """Largest radius."""
+    shrink: float = 0.0
+    """Share by which look-ups near the centre are drawn towards it."""
+    push: Float[np.ndarray, " 2"] | None = None
+    """Shift of the look-ups at the centre, px."""
 
 
-def _eye_bump(points: Points, eye: Eye) -> _Bump:
+def _bumps(points: Points, amount: Exaggeration) -> list[_Bump]:
+    """The regions of a face that the caricature moves."""
+    bumps = []
+    if amount.eye_gain != 1.0:
+        bumps += [_eye_bump(points, eye, 1.0 - 1.0 / amount.eye_gain) for eye in EYES]
+    if amount.chin != 0.0:
+        bumps += _jaw_bumps(points, amount.chin)
+    return bumps
+
+
+def _eye_bump(points: Points, eye: Eye, shrink: float) -> _Bump:
     """Region of an eye; from its corners only, which do not move when it blinks."""
     outer, inner = points[eye.upper[0]], points[eye.upper[-1]]
-    width = float(np.linalg.norm(inner - outer))
-    widest = max(float(np.linalg.norm(points[e.upper[-1]] - points[e.upper[0]])) for e in EYES)
-    axis = (inner - outer) / max(width, 1e-6)
-    return _Bump(0.5 * (outer + inner), np.array([1.1 * width, 1.0 * widest]) + 1e-6, axis)
+    width = float(np.linalg.norm(inner - outer)) + 1e-6
+    widest = max(float(np.linalg.norm(points[e.upper[-1]] - points[e.upper[0]])) for e in EYES) + 1e-6
+    x, y = (inner - outer) / width
+    radii = np.array([1.1 * width, widest])  # a turned head narrows the eye, not its height
+    axes = np.array([[x, y], [-y, x]]) / radii[:, None]
+    return _Bump(0.5 * (outer + inner), axes, float(radii.max()), shrink=shrink)
+
+
+def _jaw_bumps(points: Points, chin: float) -> list[_Bump]:
+    width = float(face_widths(points[None])[0]) + 1e-6
+    up = points[FOREHEAD] - points[CHIN]
+    across = np.array([-up[1], up[0]]) / (float(np.linalg.norm(up)) + 1e-6)
+    bumps = []
+    for jaw in JAWS:
+        centre = points[list(jaw)].mean(0)
+        outward = across * np.sign((centre - points[CHIN]) @ across)
+        radius = 2.0 * JAW_SIGMA * width
+        bumps.append(_Bump(centre, np.eye(2) / radius, radius, push=chin * width * outward))
+    return bumps
 
 
 def offsets(
@@ -72,32 +104,27 @@ def offsets(
     Inside an eye's region the picture is magnified about the eye's centre, fully in the inner third and fading to
     nothing at its border; the map stays one-to-one for gains below 1.6.
     """
-    moved = np.zeros(positions.shape, np.float32)
-    shrink = 1.0 - 1.0 / amount.eye_gain
-    for eye in EYES if shrink else ():
-        bump = _eye_bump(points, eye)
-        away = positions - bump.centre.astype(np.float32)
-        axes = np.stack([bump.axis, [-bump.axis[1], bump.axis[0]]]) / bump.radii[:, None]
-        local = away @ axes.T.astype(np.float32)
-        inside = 1.0 - smoothstep(0.3, 1.0, np.hypot(local[..., 0], local[..., 1]))
-        moved -= np.float32(shrink) * inside[..., None] * away
-    if amount.chin:
-        moved += _jaw_offsets(positions, points, amount.chin)
-    return moved
+    return _offsets(positions, _bumps(points, amount))
 
 
-def _jaw_offsets(positions: Float[np.ndarray, "*b 2"], points: Points, chin: float) -> Float[np.ndarray, "*b 2"]:
-    width = float(face_widths(points[None])[0])
-    up = points[FOREHEAD] - points[CHIN]
-    across = np.array([-up[1], up[0]]) / max(float(np.linalg.norm(up)), 1e-6)
-    moved = np.zeros(positions.shape, np.float32)
-    for jaw in JAWS:
-        centre = points[list(jaw)].mean(0)
-        outward = across * np.sign((centre - points[CHIN]) @ across)
-        away = positions - centre.astype(np.float32)
-        near = np.exp(-0.5 * (away[..., 0] ** 2 + away[..., 1] ** 2) / np.float32((0.2 * width + 1e-6) ** 2))
-        moved += near[..., None] * (np.float32(chin * width) * outward.astype(np.float32))
-    return moved
+def _offsets(positions: Float[np.ndarray, "*b 2"], bumps: list[_Bump]) -> Float[np.ndarray, "*b 2"]:
+    x, y = positions[..., 0], positions[..., 1]
+    moved_x, moved_y = np.zeros_like(x), np.zeros_like(y)
+    for bump in bumps:
+        away_x, away_y = x - np.float32(bump.centre[0]), y - np.float32(bump.centre[1])
+        axes = bump.axes.astype(np.float32)
+        across = axes[0, 0] * away_x + axes[0, 1] * away_y
+        down = axes[1, 0] * away_x + axes[1, 1] * away_y
+        squared = across * across + down * down
+        if bump.push is not None:
+            near = np.maximum(1.0 - squared, 0.0) ** 2
+            moved_x += near * np.float32(bump.push[0])
+            moved_y += near * np.float32(bump.push[1])
+        else:
+            inside = np.float32(-bump.shrink) * (1.0 - smoothstep(0.3, 1.0, np.sqrt(squared)))
+            moved_x += inside * away_x
+            moved_y += inside * away_y
+    return np.stack([moved_x, moved_y], axis=-1)
 
 
 def move_points(points: Points, amount: Exaggeration, anchors: Points | None = None) -> Points:
@@ -108,25 +135,12 @@ def move_points(points: Points, amount: Exaggeration, anchors: Points | None = N
         amount: how far.
         anchors: landmarks that define the warp; ``points`` themselves when unset.
     """
-    anchors = points if anchors is None else anchors
-    moved = points.astype(np.float32)
-    for _ in range(0 if amount.is_none else INVERSION_STEPS):
-        moved = points - offsets(moved, anchors, amount)
-    return moved.astype(np.float32)
-
-
-def _region(points: Points, width: int, height: int, chin: bool) -> tuple[slice, slice]:
-    """Rows and columns the warp can change."""
-    reach = [_eye_bump(points, eye) for eye in EYES]
-    low = np.min([bump.centre - bump.radii.max() for bump in reach], axis=0)
-    high = np.max([bump.centre + bump.radii.max() for bump in reach], axis=0)
-    if chin:  # the Gaussian of the jaw moves less than 0.001 face widths beyond 2.7 sigma
-        jaws = np.stack([points[list(jaw)].mean(0) for jaw in JAWS])
-        margin = 0.2 * 3.5 * float(face_widths(points[None])[0])
-        low, high = np.minimum(low, jaws.min(0) - margin), np.maximum(high, jaws.max(0) + margin)
-    left, top = np.clip(np.floor(low), 0, [width, height]).astype(int)
-    right, bottom = np.clip(np.ceil(high), 0, [width, height]).astype(int)
-    return slice(int(top), int(bottom)), slice(int(left), int(right))
+    target = points.astype(np.float32)
+    moved = target
+    bumps = _bumps(points if anchors is None else anchors, amount)
+    for _ in range(INVERSION_STEPS if bumps else 0):
+        moved = target - _offsets(moved, bumps)
+    return moved
 
 
 def warp(image: np.ndarray, points: Points, amount: Exaggeration) -> np.ndarray:
@@ -137,12 +151,17 @@ def warp(image: np.ndarray, points: Points, amount: Exaggeration) -> np.ndarray:
         points: landmarks in px of this picture.
         amount: how far.
     """
-    rows, columns = _region(points, image.shape[1], image.shape[0], amount.chin > 0)
-    if amount.is_none or rows.start >= rows.stop or columns.start >= columns.stop:
+    bumps = _bumps(points, amount)
+    if not bumps:
         return image
-    y, x = np.mgrid[rows, columns].astype(np.float32)
-    indices = np.stack([x, y], axis=-1)
-    where = indices + offsets(indices + np.float32(0.5), points, amount)
+    reach = np.array([bump.reach for bump in bumps])[:, None]
+    centres = np.array([bump.centre for bump in bumps])
+    box = box_around(np.concatenate([centres - reach, centres + reach]), 0.0, image.shape)
+    if is_empty(box):
+        return image
+    y, x = np.mgrid[box].astype(np.float32)
+    indices = cv2.merge([x, y])
+    where = indices + _offsets(indices + np.float32(0.5), bumps)
     out = image.copy()
-    out[rows, columns] = sample(image, where, cv2.INTER_CUBIC)
+    out[box] = sample(image, where, cv2.INTER_CUBIC)
     return out

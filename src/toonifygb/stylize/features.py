@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
 from toonifygb.stylize import anchors, filters
-from toonifygb.stylize.anchors import CHEEKS, EYES, LIPS, MOUTH, Eye
+from toonifygb.stylize.anchors import CHEEKS, EYES, LIPS, MOUTH, Eye, box_around, in_box, is_empty
 from toonifygb.stylize.filters import blur, mix, smoothstep
 
 if TYPE_CHECKING:
@@ -23,13 +24,8 @@ if TYPE_CHECKING:
     Points = Float[np.ndarray, "n 2"]
 
 
-def box_around(points: Points, margin_px: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Rows and columns of the picture that hold ``points`` with a margin; empty when they lie outside."""
-    low = np.floor(points.min(0) - margin_px).astype(int)
-    high = np.ceil(points.max(0) + margin_px).astype(int)
-    left, top = np.clip(low, 0, [shape[1], shape[0]])
-    right, bottom = np.clip(high, 0, [shape[1], shape[0]])
-    return slice(int(top), int(bottom)), slice(int(left), int(right))
+CATCH_LIGHTS = ((-0.34, -0.38, 0.30, 1.0), (0.36, 0.40, 0.16, 0.6))
+"""Reflections in the iris: right, down and size in radii of the iris, and brightness."""
 
 
 def draw_toon_features(painted: Picture, frame: Frame, points: Points, presence: float, unit: float) -> None:
@@ -44,53 +40,79 @@ def draw_toon_features(painted: Picture, frame: Frame, points: Points, presence:
     """
     for eye in EYES:
         _draw_eye(painted, frame, points, eye, presence, unit)
+        _draw_brow(painted, frame, points, eye, presence, unit)
     _draw_mouth(painted, frame, points, presence, unit)
     _draw_blush(painted, points, presence, unit)
-
-
-def _local(points: Points, box: tuple[slice, slice]) -> Points:
-    return points - np.array([box[1].start, box[0].start], np.float32)
 
 
 def _draw_eye(painted: Picture, frame: Frame, points: Points, eye: Eye, presence: float, unit: float) -> None:
     lids = points[list(eye.upper + eye.lower)]
     box = box_around(lids, 0.12 * unit, painted.shape)
-    if box[0].start >= box[0].stop or box[1].start >= box[1].stop:
+    if is_empty(box):
+        return
+    shape = painted[box].shape[:2]
+    outline = anchors.outline_of_eye(in_box(points, box), eye)
+    opening = anchors.mask(shape, [outline], 0.006 * unit) * np.float32(_openness(points, eye))
+    around = np.clip(1.6 * anchors.mask(shape, [outline], 0.03 * unit), 0.0, 1.0) * np.float32(presence)
+    detail = _bright_eye(filters.to_lab(frame[box]), in_box(points, box), eye, opening)
+    painted[box] = mix(painted[box], detail, around)
+
+
+def _openness(points: Points, eye: Eye) -> float:
+    """0 for a closed eye .. 1 for one open enough to show white and iris."""
+    middle = len(eye.upper) // 2
+    height = float(np.linalg.norm(points[eye.upper[middle]] - points[eye.lower[middle]]))
+    width = float(np.linalg.norm(points[eye.upper[0]] - points[eye.upper[-1]]))
+    share = np.clip((height / max(width, 1e-6) - 0.08) / 0.10, 0.0, 1.0)
+    return float(share * share * (3.0 - 2.0 * share))
+
+
+def _bright_eye(detail: Picture, points: Points, eye: Eye, opening: Plane) -> Picture:
+    """An eye with clean white, an iris lit from below, a deep pupil and two catch-lights; Lab in, Lab out."""
+    iris = points[eye.iris]
+    radius = max(float(np.linalg.norm(points[list(eye.rim)] - iris, axis=1).mean()), 1e-3)
+    grid = filters.pixel_grid(*opening.shape) + np.float32(0.5)
+    soft = 1.0 / max(radius, 1.0)  # one px, in radii of the iris
+
+    def ring(dx: float, dy: float) -> Plane:
+        """Distance from a point of the iris, in its radii."""
+        return np.hypot(grid[..., 0] - (iris[0] + dx * radius), grid[..., 1] - (iris[1] + dy * radius)) / radius
+
+    disc = 1.0 - smoothstep(1.0 - soft, 1.0 + soft, ring(0.0, 0.0))
+    white = opening * (1.0 - disc) * smoothstep(30.0, 60.0, detail[..., 0])
+    inner = disc * opening
+    core = opening * (1.0 - smoothstep(0.36, 0.52, ring(0.0, 0.0)))
+    below = smoothstep(-0.6, 0.9, (grid[..., 1] - iris[1]) / radius)
+    tone = mix(detail[..., 0], 93.0, 0.55 * white) + inner * (22.0 * below - 6.0)
+    chroma = (1.0 - 0.6 * white) * (1.0 + 0.5 * inner)
+    out = cv2.merge([mix(tone, 7.0, 0.85 * core), detail[..., 1] * chroma, detail[..., 2] * chroma])
+    for dx, dy, size, power in CATCH_LIGHTS:
+        spark = 1.0 - smoothstep(size - 0.5 * soft, size + soft, ring(dx, dy))
+        out = mix(out, np.array([99.0, 0.0, 0.0], np.float32), power * spark * opening)
+    return out
+
+
+def _draw_brow(painted: Picture, frame: Frame, points: Points, eye: Eye, presence: float, unit: float) -> None:
+    """Brows as one dark shape each: what is darker than the skin there, deepened."""
+    brow = points[list(eye.brow)]
+    box = box_around(brow, 0.06 * unit, painted.shape)
+    if is_empty(box):
         return
     region = painted[box]
-    shape = region.shape[:2]
-    detail = filters.to_lab(frame[box])
-    own = _local(points, box)
-    opening = anchors.mask(shape, [anchors.outline_of_eye(own, eye)], 0.006 * unit)
-    around = anchors.mask(shape, [anchors.outline_of_eye(own, eye)], 0.03 * unit)
-    iris, radius = own[eye.iris], float(np.linalg.norm(own[list(eye.rim)] - own[eye.iris], axis=1).mean())
-    grid = filters.pixel_grid(*shape) + np.float32(0.5)
-    ring = np.linalg.norm(grid - iris, axis=-1) / max(radius, 1e-3)
-    pupil_px = 1.0 / max(radius, 1.0)
-    disc = 1.0 - smoothstep(1.0 - pupil_px, 1.0 + pupil_px, ring)
-    white = opening * (1.0 - disc) * smoothstep(30.0, 60.0, detail[..., 0])
-    detail[..., 0] = mix(detail[..., 0], 93.0, 0.55 * white)
-    detail[..., 1:] *= (1.0 - 0.6 * white)[..., None]
-    height = (grid[..., 1] - iris[1]) / max(radius, 1e-3)
-    inner = disc * opening
-    glow = smoothstep(-0.6, 0.9, height)
-    detail[..., 0] += inner * (22.0 * glow - 6.0)
-    detail[..., 1:] *= (1.0 + 0.5 * inner)[..., None]
-    core = (1.0 - smoothstep(0.36, 0.52, ring)) * opening
-    detail[..., 0] = mix(detail[..., 0], 7.0, 0.85 * core)
-    for dx, dy, size, power in ((-0.34, -0.38, 0.30, 1.0), (0.36, 0.40, 0.16, 0.6)):
-        spark = np.linalg.norm(grid - (iris + radius * np.array([dx, dy], np.float32)), axis=-1) / max(radius, 1e-3)
-        spark = power * (1.0 - smoothstep(size - 0.5 * pupil_px, size + pupil_px, spark)) * opening
-        detail = mix(detail, np.array([99.0, 0.0, 0.0], np.float32), spark)
-    painted[box] = mix(region, detail, np.clip(1.6 * around, 0, 1) * np.float32(presence))
+    hair = blur(filters.to_lab(frame[box]), 0.009 * unit)
+    where = np.minimum(1.5 * anchors.mask(region.shape[:2], [in_box(brow, box)], 0.022 * unit), 1.0)
+    # the brighter half of the region is skin between the hairs, which keeps its shading
+    darker = smoothstep(2.0, 14.0, float(np.quantile(hair[..., 0], 0.8)) - hair[..., 0])
+    deep = hair * np.array([0.72, 1.0, 1.0], np.float32)
+    painted[box] = mix(region, deep, where * darker * np.float32(0.9 * presence))
 
 
 def _draw_mouth(painted: Picture, frame: Frame, points: Points, presence: float, unit: float) -> None:
     box = box_around(points[list(LIPS)], 0.08 * unit, painted.shape)
-    if box[0].start >= box[0].stop or box[1].start >= box[1].stop:
+    if is_empty(box):
         return
     region = painted[box]
-    own = _local(points, box)
+    own = in_box(points, box)
     shape = region.shape[:2]
     whole = anchors.mask(shape, [own[list(LIPS)]], 0.012 * unit)
     inside = anchors.mask(shape, [own[list(MOUTH)]], 0.006 * unit)
@@ -108,14 +130,14 @@ def _draw_mouth(painted: Picture, frame: Frame, points: Points, presence: float,
 
 def _draw_blush(painted: Picture, points: Points, presence: float, unit: float) -> None:
     box = box_around(points[list(anchors.OVAL)], 0.0, painted.shape)
-    if box[0].start >= box[0].stop or box[1].start >= box[1].stop:
+    if is_empty(box):
         return
-    own = _local(points, box)
+    own = in_box(points, box)
     shape = painted[box].shape[:2]
     face = anchors.face_mask(shape, own, 0.03 * unit) * np.float32(presence)
     for cheek in CHEEKS:
         glow = anchors.spot(shape, own[cheek], 0.085 * unit) * face
-        painted[box] += glow[..., None] * np.array([0.0, 4.5, 1.5], np.float32)
+        painted[box] += glow[..., None] * np.array([0.0, 4.0, 1.5], np.float32)
 
 
 def draw_lashes(rgb: Picture, points: Points, presence: float, unit: float, ink: np.ndarray) -> None:
@@ -123,11 +145,11 @@ def draw_lashes(rgb: Picture, points: Points, presence: float, unit: float, ink:
     for eye in EYES:
         lid = points[list(eye.upper)].astype(np.float64)
         box = box_around(lid, 0.1 * unit, rgb.shape)
-        if box[0].start >= box[0].stop or box[1].start >= box[1].stop:
+        if is_empty(box):
             continue
-        stroke = _lash(_local(lid, box), unit)
+        stroke = _lash(in_box(lid, box), unit)
         plane = np.zeros(rgb[box].shape[:2], np.uint8)
-        anchors.fill(plane, stroke)
+        anchors.draw(plane, stroke)
         amount = plane.astype(np.float32) * np.float32(0.9 * presence / 255)
         rgb[box] = mix(rgb[box], ink, blur(amount, 0.003 * unit))
 

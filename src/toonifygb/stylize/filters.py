@@ -55,6 +55,17 @@ def blur(image: np.ndarray, sigma_px: float) -> np.ndarray:
     return cv2.GaussianBlur(image, (0, 0), sigma_px, borderType=BORDER)
 
 
+def wide_blur(image: np.ndarray, sigma_px: float) -> np.ndarray:
+    """Gaussian blur of great width, taken at a reduced size at which it is four px wide."""
+    factor = sigma_px / 4.0
+    if factor <= 1.5:  # not worth the detour
+        return blur(image, sigma_px)
+    height, width = image.shape[:2]
+    small = resize(image, max(1, round(width / factor)), max(1, round(height / factor)))
+    small = blur(small, 4.0)
+    return cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
+
+
 def smoothstep(low: float, high: float, value: np.ndarray) -> np.ndarray:
     """0 below ``low``, 1 above ``high``, and a cubic with level ends between."""
     t = np.clip((value - np.float32(low)) * np.float32(1.0 / (high - low)), 0.0, 1.0)
@@ -64,8 +75,15 @@ def smoothstep(low: float, high: float, value: np.ndarray) -> np.ndarray:
 def mix(first: np.ndarray, second: np.ndarray | float, amount: np.ndarray | float) -> np.ndarray:
     """``first`` where ``amount`` is 0, ``second`` where it is 1; a plane of amounts serves all channels."""
     if isinstance(amount, np.ndarray) and amount.ndim == first.ndim - 1:
-        amount = amount[..., None]
+        amount = spread(amount, first.shape[-1])
     return first + (second - first) * amount
+
+
+def spread(plane: Plane, channels: int) -> Picture:
+    """The plane repeated for every channel: arithmetic on whole pictures is several times faster than numpy's
+    broadcasting along so short an axis.
+    """
+    return cv2.merge([plane] * channels)
 
 
 def dot(first: Picture, second: Picture) -> Plane:
@@ -109,9 +127,9 @@ def structure(lab: Picture, sigma_px: float, rest: tuple[float, float] = (0.0, 0
     xy = tensor[..., 1] - np.float32(weight * np.sin(angle) * np.cos(angle))
     yy = tensor[..., 2] + np.float32(weight * np.cos(angle) ** 2)
     tangent = 0.5 * np.arctan2(2.0 * xy, xx - yy) + np.float32(np.pi / 2)
-    spread = np.sqrt((xx - yy) ** 2 + 4.0 * xy * xy)
+    excess = np.sqrt((xx - yy) ** 2 + 4.0 * xy * xy)
     # 0.05 squared Lab units per px²: below it the direction is sensor noise, and claims no clarity
-    return cv2.merge([np.cos(tangent), np.sin(tangent)]), spread / (xx + yy + np.float32(0.05))
+    return cv2.merge([np.cos(tangent), np.sin(tangent)]), excess / (xx + yy + np.float32(0.05))
 
 
 def flow_blur(image: np.ndarray, tangents: Field, sigma_px: float, step_px: float | None = None) -> np.ndarray:
@@ -136,13 +154,13 @@ def flow_blur(image: np.ndarray, tangents: Field, sigma_px: float, step_px: floa
     return total * np.float32(1.0 / weight_sum)
 
 
-def ink_response(lightness: Plane, tangents: Field, sigma_px: float, spread: float = 1.6) -> Plane:
+def ink_response(lightness: Plane, tangents: Field, sigma_px: float, ratio: float = 1.6) -> Plane:
     """How much darker a place is than its surroundings, in L, calmed along the edge flow.
 
     The difference of Gaussians of FDoG/XDoG (Winnemöller, Kyprianidis & Olsen 2012, Eq. 5-7) with its second,
     flow-aligned integration; positive where ink belongs.
     """
-    response = blur(lightness, sigma_px * spread) - blur(lightness, sigma_px)
+    response = blur(lightness, sigma_px * ratio) - blur(lightness, sigma_px)
     return flow_blur(response, tangents, 2.5 * sigma_px)
 
 
@@ -161,19 +179,22 @@ def kuwahara(lab: Picture, tangents: Field, anisotropy: Plane, radius_px: float)
     """
     mean = blur(lab, _SIZE * radius_px)
     variance = blur(dot(lab, lab), _SIZE * radius_px) - dot(mean, mean)
-    weight = (1.0 + np.maximum(variance, 0.0)) ** -2
+    weight = 1.0 / (1.0 + np.maximum(variance, 0.0))
     weight *= weight
-    table = cv2.merge([mean * weight[..., None], weight])
-    stretch = (1.0 + anisotropy)[..., None]
-    along = tangents * stretch * np.float32(_REACH * radius_px)
-    across = cv2.merge([-tangents[..., 1], tangents[..., 0]]) / stretch * np.float32(_REACH * radius_px)
+    weight *= weight
+    table = cv2.merge([mean * spread(weight, 3), weight])
+    along = np.float32(_REACH * radius_px) * (1.0 + anisotropy)
+    across = np.float32((_REACH * radius_px) ** 2) / along
+    x, y = tangents[..., 0], tangents[..., 1]
+    axes = cv2.merge([x * along, y * along]), cv2.merge([-y * across, x * across])
     grid = pixel_grid(*lab.shape[:2])
     total = np.zeros_like(table)
-    for sector in range(SECTORS):
+    for sector in range(SECTORS // 2):
         angle = 2.0 * np.pi * sector / SECTORS
-        offset = np.float32(np.cos(angle)) * along + np.float32(np.sin(angle)) * across
+        offset = cv2.addWeighted(axes[0], float(np.cos(angle)), axes[1], float(np.sin(angle)), 0.0)
         total += sample(table, grid + offset)
-    return total[..., :3] / total[..., 3:]
+        total += sample(table, grid - offset)
+    return total[..., :3] / spread(np.ascontiguousarray(total[..., 3]), 3)
 
 
 CURVE_STEPS = 4096
@@ -185,20 +206,24 @@ def curve_lookup(values: Plane, curve: Float[np.ndarray, " n"], top: float = LAB
     return curve[index.astype(np.int32)]
 
 
-def band_curve(levels: list[float], softness: float, remain: float) -> Float[np.ndarray, " n"]:
+def band_curve(
+    levels: list[float], softness: float, remain: float, contrast: tuple[float, float] = (0.0, 1.0)
+) -> Float[np.ndarray, " n"]:
     """Tone curve that gathers L into bands.
 
     Args:
         levels: the L of each band, ascending.
         softness: half-width in L of the step between two bands.
         remain: share 0..1 of the original gradation kept inside the bands.
+        contrast: L that stays, and the factor by which others move away from it.
     """
     tone = np.linspace(0.0, LAB_RANGE, CURVE_STEPS, dtype=np.float32)
     stairs = np.full_like(tone, levels[0])
     for low, high in itertools.pairwise(levels):
         middle = 0.5 * (low + high)
         stairs += np.float32(high - low) * smoothstep(middle - softness, middle + softness, tone)
-    return mix(stairs, tone, remain).astype(np.float32)
+    pivot, gain = contrast
+    return np.clip(pivot + gain * (mix(stairs, tone, remain) - pivot), 0.0, LAB_RANGE).astype(np.float32)
 
 
 def cluster_levels(values: Float[np.ndarray, " n"], count: int) -> list[float]:

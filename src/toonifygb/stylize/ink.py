@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -81,9 +82,7 @@ class Ink:
         rgb = mix(rgb, INK, 0.95 * line)
         if presence > 0:
             features.draw_lashes(rgb, points, presence, state["unit"], INK)
-        grain = textures.look_up(textures.noise_tile(0.9, 11), filters.pixel_grid(height, width))
-        fibre = textures.look_up(textures.noise_tile(5.0, 12), filters.pixel_grid(height, width))
-        return filters.to_bytes(rgb + (0.006 * grain + 0.004 * fibre)[..., None])
+        return filters.to_bytes(rgb + _paper((height, width)))
 
 
 def _tone_and_lines(lab: Lab, points: Points, presence: float, unit: float) -> np.ndarray:
@@ -108,24 +107,35 @@ def _toned(darkness: Plane, keep: Plane, points: Points, presence: float, state:
     first = smoothstep(0.10, 0.16, darkness)
     second = smoothstep(0.34, 0.42, darkness)
     rgb = PAPER * (1.0 - (1.0 - WASH) * (0.42 * first + 0.42 * second)[..., None])
-    share = textures.head_share(shape, points, presence, unit) if presence > 0 else np.zeros(shape, np.float32)
-    fixed = filters.pixel_grid(*shape) + np.float32(0.5)
-    riding = textures.head_coordinates(shape, points, state["template"]) if presence > 0 else fixed
+    share = textures.head_share(shape, points, presence, unit) if presence > 0 else None
+    place = textures.head_place(points, state["template"]) if presence > 0 else textures.IDENTITY
     for angle, start in zip(HATCH_ANGLES, (0.22, 0.46), strict=True):
         cover = 0.75 * smoothstep(start, start + 0.45, darkness) + 0.16 * smoothstep(start, start + 0.04, darkness)
-        lines = mix(
-            _hatch(fixed, angle, unit, cover), _hatch(riding, angle, unit, cover), smoothstep(0.4, 0.6, share)
-        )
+        lines = _hatch(textures.IDENTITY, angle, unit, cover)
+        if share is not None:
+            lines = mix(lines, _hatch(place, angle, unit, cover), smoothstep(0.4, 0.6, share))
         rgb = mix(rgb, INK, 0.8 * lines * (1.0 - keep))
     return mix(rgb, INK, 0.96 * smoothstep(0.66, 0.74, darkness))
 
 
-def _hatch(where: np.ndarray, angle: float, unit: float, cover: Plane) -> Plane:
+def _hatch(place: Float[np.ndarray, "2 3"], angle: float, unit: float, cover: Plane) -> Plane:
     """Slightly wavering parallel lines whose thickness is the share ``cover`` of the sheet they ink."""
+    height, width = cover.shape
     period = max(HATCH_PERIOD * unit, 3.0)
-    waver = textures.look_up(textures.noise_tile(8.0, 13), where * np.float32(0.25 * 180.0 / max(unit, 1.0)))
-    across = where[..., 0] * np.float32(np.cos(angle)) + where[..., 1] * np.float32(np.sin(angle))
-    phase = across * np.float32(1.0 / period) + np.float32(0.22) * waver
+    waver = textures.laid(cover.shape, textures.noise_tile(8.0, 13), place, 45.0 / max(unit, 1.0))
+    x, y, start = np.array([np.cos(angle), np.sin(angle)]) @ place / period
+    columns = (x * np.arange(width)).astype(np.float32)
+    rows = (y * np.arange(height) + start).astype(np.float32)
+    phase = rows[:, None] + columns + np.float32(0.22) * waver
     distance = np.abs(phase - np.rint(phase)) * 2.0  # 0 on a line, 1 half way between two
     edge = 1.6 / period  # one px of anti-aliasing, in these units
     return smoothstep(-edge, edge, cover - distance) * np.minimum(cover * 8.0, 1.0)
+
+
+@functools.lru_cache(maxsize=2)
+def _paper(shape: tuple[int, int]) -> np.ndarray:
+    """Tooth and fibres of the sheet, fixed in the picture; a small difference in sRGB. Read-only."""
+    tooth = 0.006 * textures.fixed_noise(shape, 0.9, 11) + 0.004 * textures.fixed_noise(shape, 5.0, 12)
+    sheet = filters.spread(tooth.astype(np.float32), 3)
+    sheet.setflags(write=False)
+    return sheet

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from toonifygb.stylize.filters import blur, pixel_grid, resize, sample
+from toonifygb.stylize.filters import blur, pixel_grid, resize, sample, spread
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     Frame = UInt8[np.ndarray, "h w 3"]
     Field = Float[np.ndarray, "h w 2"]
 
-RADIUS = 2
-"""Frames looked at on either side."""
+RADIUS = 1
+"""Frames looked at on either side; a second one brings a quarter of the gain of the first, for the same cost."""
 NOISE = 7.0
 """Difference in 8-bit levels, averaged over a few px, at which a neighbour stops being the same surface."""
 LONGEST_SIDE = 720
@@ -68,9 +68,9 @@ def _average(window: Sequence[Frame], index: int) -> Float[np.ndarray, "h w 3"]:
         difference = blur(cv2.cvtColor(cv2.absdiff(moved, window[index]), cv2.COLOR_RGB2GRAY), 2.0)
         weight = np.exp(-((difference.astype(np.float32) * np.float32(1.0 / NOISE)) ** 2))
         weight *= np.float32(1.0 / (1.0 + 0.25 * abs(other - index)))
-        total += weight[..., None] * moved
+        total += spread(weight, 3) * moved
         weights += weight
-    return total / weights[..., None]
+    return total / spread(weights, 3)
 
 
 def _half_grey(frame: Frame) -> UInt8[np.ndarray, "h w"]:

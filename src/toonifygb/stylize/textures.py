@@ -13,15 +13,15 @@ import cv2
 import numpy as np
 
 from toonifygb.stylize.anchors import EYES, OVAL, face_mask
-from toonifygb.stylize.filters import pixel_grid
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
     Plane = Float[np.ndarray, "h w"]
-    Field = Float[np.ndarray, "h w 2"]
     Points = Float[np.ndarray, "478 2"]
 
+IDENTITY = np.eye(2, 3)
+"""Place of a texture at rest in the picture."""
 TILE = 512
 """Side of the periodic noise tile, px."""
 RIGID = (
@@ -50,20 +50,38 @@ def noise_tile(sigma_px: float, seed: int) -> Float[np.ndarray, "512 512"]:
     return smooth
 
 
-def look_up(tile: Float[np.ndarray, "512 512"], where: Field) -> Plane:
-    """Periodic bilinear look-up."""
-    wrapped = np.mod(where, np.float32(TILE))
-    x, y = np.ascontiguousarray(wrapped[..., 0]), np.ascontiguousarray(wrapped[..., 1])
-    return cv2.remap(tile, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+def fixed_noise(shape: tuple[int, int], sigma_px: float, seed: int, zoom: float = 1.0) -> Plane:
+    """Noise at rest in the picture, ``zoom`` texels of the tile per px. Read-only."""
+    return _fixed_noise(shape, sigma_px, seed, zoom)
 
 
-def head_coordinates(shape: tuple[int, int], points: Points, template: Points) -> Field:
-    """Position of every pixel on the face of ``template``: the affine map that carries today's face onto it."""
+@functools.lru_cache(maxsize=8)
+def _fixed_noise(shape: tuple[int, int], sigma_px: float, seed: int, zoom: float) -> Plane:
+    plane = laid(shape, noise_tile(sigma_px, seed), IDENTITY, zoom)
+    plane.setflags(write=False)
+    return plane
+
+
+def laid(
+    shape: tuple[int, int], tile: Float[np.ndarray, "512 512"], place: Float[np.ndarray, "2 3"], zoom: float
+) -> Plane:
+    """The tile, repeated without end, seen through the affine map ``place`` (picture px to texture px)."""
+    # cv2 counts from pixel centres on both sides; only where the origin of the tile lies changes, which is free
+    return cv2.warpAffine(
+        tile,
+        (place * zoom).astype(np.float64),
+        (shape[1], shape[0]),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_WRAP,
+    )
+
+
+def head_place(points: Points, template: Points) -> Float[np.ndarray, "2 3"]:
+    """The affine map from today's picture onto the face of ``template``, on which strokes ride with the head."""
     rigid = list(RIGID)
     source = np.concatenate([points[rigid], np.ones((len(rigid), 1))], axis=1).astype(np.float64)
     affine, *_ = np.linalg.lstsq(source, template[rigid].astype(np.float64), rcond=None)
-    affine = affine.astype(np.float32)
-    return (pixel_grid(*shape) + np.float32(0.5)) @ affine[:2] + affine[2]
+    return affine.T
 
 
 def head_share(shape: tuple[int, int], points: Points, presence: float, unit: float) -> Plane:
@@ -93,11 +111,10 @@ def anchored_noise(
         grain: size of a grain in face widths.
         seed: which noise.
     """
-    zoom = np.float32(2.0 / max(grain * unit, 0.5))  # a grain is two texels of the tile
-    tile = noise_tile(1.0, seed)
-    fixed = look_up(tile, pixel_grid(*shape) * zoom)
+    zoom = 2.0 / max(grain * unit, 0.5)  # a grain is two texels of the tile
+    fixed = fixed_noise(shape, 1.0, seed, zoom)
     if presence == 0:
         return fixed
-    riding = look_up(tile, head_coordinates(shape, points, template) * zoom)
+    riding = laid(shape, noise_tile(1.0, seed), head_place(points, template), zoom)
     share = head_share(shape, points, presence, unit)
-    return (fixed * (1.0 - share) + riding * share) / np.hypot(share, 1.0 - share)
+    return (fixed * (1.0 - share) + riding * share) / np.sqrt(share * share + (1.0 - share) ** 2)

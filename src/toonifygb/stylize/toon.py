@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 
 from toonifygb.stylize import features, filters
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     Lab = Float[np.ndarray, "h w 3"]
     Points = Float[np.ndarray, "478 2"]
 
-WORK_FACE_PX = 180
+WORK_FACE_PX = 150
 """Width of the face at which regions are simplified; more shows pores, less loses nostrils."""
 INK = np.array([0.17, 0.09, 0.13], np.float32)
 """sRGB of the lines: a warm near-black, which sits better on skin than pure black."""
@@ -45,17 +46,23 @@ class Toon:
 
     def prepare(self, samples: Frames, faces: Faces) -> dict[str, Any]:
         """Bands from the clip's own tones, its skin colour, and the width of its face."""
-        unit = face_unit(samples, faces)
         labs = [filters.to_lab(frame) for frame in samples]
+        unit = face_unit(samples, faces)
         tones = np.concatenate([blur(lab[..., 0], 0.02 * unit)[::4, ::4].ravel() for lab in labs])
         skin = skin_pixels(labs, faces)
-        skin_tones = skin[:, 0] if len(skin) else tones
+        has_skin = len(skin) > 0
+        middle = np.median(skin, axis=0) if has_skin else np.array([60.0, 0.0, 0.0])
+        dark, bright = np.quantile(tones, [0.02, 0.98])
+        # a flat clip is given the depth of a drawing, within limits; the skin's own lightness stays
+        gain = float(np.clip(88.0 / max(bright - dark, 1.0), 1.0, 1.15))
+        levels = filters.cluster_levels(tones, 6)
+        skin_levels = filters.cluster_levels(skin[:, 0], 4) if has_skin else levels
         return {
             "unit": unit,
-            "has_skin": bool(len(skin)),
-            "skin": [float(value) for value in (np.median(skin, axis=0) if len(skin) else np.zeros(3))],
-            "tone_curve": filters.band_curve(filters.cluster_levels(tones, 6), softness=1.6, remain=0.35),
-            "skin_curve": filters.band_curve(filters.cluster_levels(skin_tones, 4), softness=1.2, remain=0.25),
+            "has_skin": has_skin,
+            "skin": [float(value) for value in middle],
+            "tone_curve": filters.band_curve(levels, 1.6, 0.35, (float(middle[0]), gain)),
+            "skin_curve": filters.band_curve(skin_levels, 1.2, 0.25, (float(middle[0]) - 6.0, 1.2)),
         }
 
     def apply(self, frames: Frames, faces: Faces, mattes: Any, state: dict[str, Any]) -> Frames:
@@ -90,7 +97,7 @@ def _simplified(lab: Lab, points: Points, presence: float, state: dict[str, Any]
     simple = filters.kuwahara(lab, tangents, clarity, 0.03 * unit)
     fine = lab - simple
     amount = np.sqrt(filters.dot(fine, fine))
-    simple += fine * smoothstep(10.0, 22.0, blur(amount, 0.006 * unit))[..., None]
+    simple += fine * filters.spread(smoothstep(7.0, 16.0, blur(amount, 0.006 * unit)), 3)
     skin = np.zeros(lab.shape[:2], np.float32)
     if state["has_skin"]:
         colour = blur(simple, 0.02 * unit)
@@ -101,7 +108,7 @@ def _simplified(lab: Lab, points: Points, presence: float, state: dict[str, Any]
         inside = face_mask(lab.shape[:2], points, 0.03 * unit) * np.float32(presence)
         skin *= 0.5 + 0.5 * inside
         simple[..., 0] = mix(simple[..., 0], blur(simple[..., 0], 0.02 * unit), inside * skin)
-        simple[..., 1:] = mix(simple[..., 1:], blur(simple[..., 1:], 0.06 * unit), 0.7 * inside * skin)
+        simple[..., 1:] = mix(simple[..., 1:], filters.wide_blur(simple[..., 1:], 0.06 * unit), 0.7 * inside * skin)
     response = filters.ink_response(mix(simple[..., 0], lab[..., 0], 0.75), tangents, 0.008 * unit)
     if presence > 0:
         response *= 1.0 + np.float32(presence) * anatomy(lab.shape[:2], points, unit)
@@ -115,7 +122,7 @@ def _shaded(fields: np.ndarray, state: dict[str, Any]) -> Lab:
         filters.curve_lookup(tone, state["tone_curve"]), filters.curve_lookup(tone, state["skin_curve"]), skin
     )
     shade = smoothstep(2.0, 24.0, np.float32(state["skin"][0]) - banded) * skin
-    a = fields[..., 1] * (1.22 - 0.05 * skin) + 5.0 * shade
-    b = fields[..., 2] * (1.22 - 0.05 * skin) - 3.0 * shade
-    lifted = banded + 4.0 * skin * (1.0 - banded / 100.0) * 2.0
-    return np.dstack([lifted, a, b]).astype(np.float32)
+    chroma = 1.22 - 0.04 * skin
+    a = fields[..., 1] * chroma + 3.5 * shade
+    b = fields[..., 2] * chroma - 1.5 * shade
+    return cv2.merge([banded, a, b])
