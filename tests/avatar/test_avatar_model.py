@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import pytest
 import torch
 from make import TINY, tiny_avatar, tiny_head, tiny_motion
 
 from toonifygb.avatar import POSE_DRIVERS, MouthVolume, init_avatar
+from toonifygb.avatar.fields import each
 from toonifygb.avatar.init import nearest_squared
-from toonifygb.avatar.layout import flatten, slices, unflatten
 from toonifygb.avatar.skinning import activate, blend_parameters, concatenate, skin_splats
 from toonifygb.avatar.transfer import consistency, mix_vertices
-from toonifygb.structures import HeadMotion
+from toonifygb.structures import GaussianParams, HeadMotion
 
 SHAPE = torch.tensor([0.5, -0.5, 0.2])
+
+
+def flatten(params: GaussianParams) -> torch.Tensor:
+    return torch.cat([tensor.flatten() for _, tensor in each(params)])
 
 
 def still(n_expressions: int = 4) -> HeadMotion:
@@ -163,18 +166,6 @@ def test_pose_drivers_keep_their_range() -> None:
     far = tiny_motion()[0]
     far = replace(far, joints=far.joints + 1.0, translation=far.translation + 1.0)
     assert (avatar.drivers.coefficients(far) <= seen.amax(0) + 1e-5).all()
-
-
-@pytest.mark.parametrize("lead", [(), (3,)])
-def test_flat_layout_round_trip(lead: tuple[int, ...]) -> None:
-    avatar = tiny_avatar()
-    params = avatar.deltas.map(lambda delta: delta[: lead[0]]) if lead else avatar.neutral
-    flat = flatten(params)
-    again = unflatten(flat, params.n, 4)
-    for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
-        assert torch.equal(getattr(params, name), getattr(again, name))
-    assert again.means.data_ptr() == flat.data_ptr(), "unflatten must not copy"
-    assert list(slices(10, 4).values())[-1].stop == 10 * 23
 
 
 def test_cylinder_distance_and_penalty() -> None:

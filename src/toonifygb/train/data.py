@@ -57,6 +57,8 @@ class Dataset:
     """left, top, right, bottom of each crop in px of the full frame."""
     full_camera: Camera
     split: Split
+    fingerprint: str
+    """Changes with everything the crops depend on."""
 
     @property
     def n_frames(self) -> int:
@@ -75,8 +77,8 @@ class Dataset:
 
     def target(self, index: int) -> tuple[Float[Tensor, "s s 3"], Float[Tensor, "s s"]]:
         """What a render of this frame should be: colour × matte on black, 0..1, and the matte."""
-        matte = torch.from_numpy(self.mattes[index]).float().div_(255)
-        color = torch.from_numpy(self.frames[index]).float().div_(255)
+        matte = torch.from_numpy(self.mattes[index].astype(np.float32)).div_(255)
+        color = torch.from_numpy(self.frames[index].astype(np.float32)).div_(255)
         return color.mul_(matte[..., None]), matte
 
 
@@ -158,6 +160,7 @@ def load_dataset(folder: Path | str) -> Dataset:
         boxes=boxes,
         full_camera=Camera(torch.tensor(camera["K"]), torch.tensor(camera["world_to_camera"]), *camera["size"]),
         split=Split(tuple(facts["train"]), tuple(facts["test"])),
+        fingerprint=json.dumps(facts["fingerprint"], sort_keys=True),
     )
 
 

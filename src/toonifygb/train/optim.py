@@ -1,0 +1,155 @@
+"""Learning rates of every parameter, their schedule, blending, and the Adam step over neutral and deltas.
+
+The rates are 3D Gaussian Blendshapes' (3DGB), made for 40 000 steps. A shorter training covers the same ground in
+fewer steps: what would hardly move in so few (delta positions and opacities) takes proportionally larger ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+
+from toonifygb.avatar.fields import FIELDS, each, rows, width
+from toonifygb.structures import GaussianParams
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+    from toonifygb.render.fused import Kernels
+    from toonifygb.train.state import Trained, TrainState
+
+FULL_STEPS = 40_000
+"""Steps that the rates were made for."""
+NEUTRAL_RATES = {
+    "means": 1.6e-4,
+    "quats": 1e-3,
+    "log_scales": 5e-3,
+    "opacity_logits": 5e-2,
+    "sh_dc": 2.5e-3,
+    "sh_rest": 1.25e-4,
+}
+DELTA_RATES = {
+    "means": 3.2e-7,
+    "quats": 1e-4,
+    "log_scales": 5e-4,
+    "opacity_logits": 5e-5,
+    "sh_dc": 1.25e-3,
+    "sh_rest": 1.25e-3,
+}
+"""The seed's list: (3.2e-7, 5e-5, 5e-4, 1e-4, 1.25e-3) for position, opacity, scale, rotation, SH."""
+MEANS_DECAY = 0.01
+"""Final over first rate of the neutral positions; log-linear over the first ``DECAY_SHARE`` of the steps."""
+DECAY_SHARE = 0.75
+SETTLE_FROM, SETTLE_TO = 0.6, 0.1
+"""From this share of the steps on all rates fall, log-linear, to this share of themselves: it quiets the noise of
+single-image steps."""
+
+
+@dataclass(frozen=True)
+class Coefficients:
+    """What one frame multiplies the deltas with."""
+
+    expression: Float[Tensor, " e"]
+    driver: Float[Tensor, " d"]
+
+
+def blend(state: TrainState, psi: Coefficients, kernels: Kernels) -> GaussianParams:
+    """Raw parameters of one frame: every Gaussian's neutral, plus the deltas of those that have some."""
+    blended = {}
+    for name, neutral in each(state.neutral.values):
+        values = neutral.clone()
+        for trained, coefficients in ((state.driver, psi.driver), (state.expression, psi.expression)):
+            deltas = rows(getattr(trained.values, name))
+            if len(deltas):
+                base = values.view(-1)[: deltas.shape[1]]
+                base.copy_(kernels.blend(base, deltas, coefficients))
+        blended[name] = values
+    return GaussianParams(**blended)
+
+
+class Optimizer:
+    """Adam over all parameters of a ``TrainState``; holds rates, no state of its own.
+
+    Args:
+        state: whose sizes the rates are laid out for.
+        steps: length of the whole training.
+        kernels: where the fused updates run.
+    """
+
+    def __init__(self, state: TrainState, steps: int, kernels: Kernels) -> None:
+        self._kernels = kernels
+        self._steps = steps
+        stretch = max(1.0, FULL_STEPS / steps)
+        delta = DELTA_RATES | {name: DELTA_RATES[name] * stretch for name in ("means", "opacity_logits")}
+        self._neutral = _rates(state.neutral.values, NEUTRAL_RATES)
+        self._expression = _rates(state.expression.values, delta)
+        self._driver = _rates(state.driver.values, delta)
+
+    def step(self, state: TrainState, gradient: GaussianParams, psi: Coefficients) -> None:
+        """One Adam step.
+
+        Args:
+            state: changed in place; its ``step`` is the number of this step, from 1.
+            gradient: for the blended parameters of all Gaussians: the neutral's own, and times ψk that of ΔBk.
+            psi: the frame's coefficients.
+        """
+        settle = settling(state.step / self._steps)
+        means = means_decay(state.step / self._steps)
+        for name, g in each(gradient):
+            factor = means if name == "means" else settle
+            values, first, second = _parts(state.neutral, name)
+            flat = g.reshape(-1)
+            self._kernels.adam_step(
+                values.view(-1), first.view(-1), second.view(-1), flat, self._neutral[name] * factor, state.step
+            )
+            for trained, rates, coefficients, scale in (
+                (state.expression, self._expression, psi.expression, state.scale),
+                (state.driver, self._driver, psi.driver, None),
+            ):
+                values, first, second = _parts(trained, name)
+                if not len(values):
+                    continue
+                p = rows(values).shape[1]
+                self._kernels.blend_adam_step(
+                    rows(values),
+                    rows(first),
+                    rows(second),
+                    coefficients,
+                    flat[:p],
+                    rates[name] * settle,
+                    state.step,
+                    scale=scale,
+                    widths=(width(name, state.neutral.values.sh.shape[1]),),
+                    skip_inactive=True,
+                )
+
+
+def means_decay(share: float) -> float:
+    """Factor on the rate of the neutral positions after a share 0..1 of the steps."""
+    return MEANS_DECAY ** min(1.0, share / DECAY_SHARE)
+
+
+def settling(share: float) -> float:
+    """Factor on all other rates after a share 0..1 of the steps."""
+    return SETTLE_TO ** max(0.0, (share - SETTLE_FROM) / (1 - SETTLE_FROM))
+
+
+def _parts(trained: Trained, name: str) -> tuple[Tensor, Tensor, Tensor]:
+    return getattr(trained.values, name), getattr(trained.first, name), getattr(trained.second, name)
+
+
+def _rates(params: GaussianParams, rates: dict[str, float]) -> dict[str, Tensor]:
+    """Learning rate of every float of one row, by field; ``sh`` splits into ``sh_dc`` and ``sh_rest``."""
+    n, k = params.sh.shape[-3], params.sh.shape[-2]
+    tables = {}
+    for name in FIELDS:
+        if name == "sh":
+            table = torch.full((n, k, 3), rates["sh_rest"])
+            table[:, 0] = rates["sh_dc"]
+            tables[name] = table.view(-1)
+        else:
+            tables[name] = torch.full((n * width(name, k),), rates[name])
+    return tables

@@ -1,0 +1,208 @@
+"""Everything that training changes, and its way to disk and back.
+
+All Gaussians stand in one record, in the order in which the renderer takes them: face Gaussians that some
+expression moves, other face Gaussians, upper mouth, lower mouth. So the deltas of expressions (first group) and of
+the pose (both face groups) each belong to a prefix of every field, and blending is a matrix-vector product on it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from toonifygb.avatar.fields import cut, cut_deltas, extended, join
+from toonifygb.avatar.transfer import consistency
+from toonifygb.errors import InputError
+from toonifygb.structures import GaussianParams, TensorRecord
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jaxtyping import Float, Int
+    from torch import Tensor
+
+    from toonifygb.avatar import Avatar
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Sizes of the four groups."""
+
+    moved: int
+    """Face Gaussians that some expression or eyelid moves."""
+    still: int
+    """The other face Gaussians."""
+    upper: int
+    lower: int
+
+    @property
+    def face(self) -> int:
+        """Both face groups."""
+        return self.moved + self.still
+
+    @property
+    def all(self) -> int:
+        """Every Gaussian."""
+        return self.face + self.upper + self.lower
+
+
+@dataclass(frozen=True)
+class Trained(TensorRecord):
+    """Parameters with Adam's moments; the tensors are changed in place."""
+
+    values: GaussianParams
+    first: GaussianParams
+    """Running mean of the gradient."""
+    second: GaussianParams
+    """Running mean of its square."""
+
+    @classmethod
+    def fresh(cls, values: GaussianParams) -> Trained:
+        """Parameters before their first step, copied."""
+        values = values.map(lambda tensor: tensor.clone(memory_format=torch.contiguous_format))
+        return cls(values, values.map(torch.zeros_like), values.map(torch.zeros_like))
+
+
+@dataclass
+class TrainState:
+    """A training in progress."""
+
+    counts: Counts
+    neutral: Trained
+    expression: Trained
+    """Deltas of expressions and eyelids for the ``moved`` group."""
+    driver: Trained
+    """Deltas driven by the pose for both face groups."""
+    scale: Float[Tensor, "e moved"]
+    """Blendshape consistency: how far each expression delta may be trained."""
+    skin_weights: Float[Tensor, "n 5"]
+    pose_basis: Float[Tensor, "p face 3"]
+    step: int
+    """Steps done."""
+    order: Int[Tensor, " t"]
+    """Training frames of this epoch, shuffled."""
+    position: int
+    """Frames of ``order`` already taken."""
+    generator: torch.Generator
+
+    @classmethod
+    def start(cls, avatar: Avatar, seed: int) -> TrainState:
+        """The state before the first step."""
+        n_moved = avatar.meta["n_moved"]
+        counts = Counts(n_moved, avatar.neutral.n - n_moved, avatar.mouth_upper.n, avatar.mouth_lower.n)
+        n_expression = avatar.n_expressions + avatar.n_eyelids
+        expression = cut_deltas(cut(avatar.deltas, 0, n_expression), 0, n_moved)
+        mouth = [
+            avatar.mouth_upper_weights.expand(counts.upper, -1),
+            avatar.mouth_lower_weights.expand(counts.lower, -1),
+        ]
+        return cls(
+            counts=counts,
+            neutral=Trained.fresh(join([avatar.neutral, avatar.mouth_upper, avatar.mouth_lower])),
+            expression=Trained.fresh(expression),
+            driver=Trained.fresh(avatar.deltas.map(lambda delta: delta[n_expression:])),
+            # At the start the deltas are the mesh's displacements, which is what consistency is defined by.
+            scale=consistency(expression.means),
+            skin_weights=torch.cat([avatar.skin_weights, *mouth]),
+            pose_basis=avatar.pose_basis.clone(),
+            step=0,
+            order=torch.zeros(0, dtype=torch.int64),
+            position=0,
+            generator=torch.Generator().manual_seed(seed),
+        )
+
+    def next_frame(self, frames: tuple[int, ...]) -> int:
+        """The next training frame: every epoch takes each frame once, in a new random order."""
+        if self.position >= len(self.order):
+            self.order = torch.tensor(frames)[torch.randperm(len(frames), generator=self.generator)]
+            self.position = 0
+        self.position += 1
+        return int(self.order[self.position - 1])
+
+    def avatar(self, template: Avatar) -> Avatar:
+        """The avatar that the parameters make of ``template``; everything is copied."""
+        counts, values = self.counts, self.neutral.values.map(torch.clone)
+        first_mouth, second_mouth = counts.face, counts.face + counts.upper
+        deltas = join([extended(self.expression.values, counts.face), self.driver.values])
+        return replace(
+            template,
+            neutral=cut(values, 0, first_mouth),
+            mouth_upper=cut(values, first_mouth, second_mouth),
+            mouth_lower=cut(values, second_mouth, counts.all),
+            deltas=deltas,
+            skin_weights=self.skin_weights[: counts.face].clone(),
+            pose_basis=self.pose_basis.clone(),
+            meta=template.meta | {"n_moved": counts.moved},
+        )
+
+
+_TENSORS = ("scale", "skin_weights", "pose_basis", "order")
+_TRAINED = ("neutral", "expression", "driver")
+
+
+def write_checkpoint(state: TrainState, path: Path, facts: dict[str, Any]) -> None:
+    """Writes the state atomically: a process killed at any moment leaves the old file or the new one."""
+    tensors = {name: getattr(state, name) for name in _TENSORS}
+    tensors |= {name: tensor for group in _TRAINED for name, tensor in _named(group, getattr(state, group))}
+    tensors["generator"] = state.generator.get_state()
+    counts = state.counts
+    notes = facts | {
+        "counts": [counts.moved, counts.still, counts.upper, counts.lower],
+        "step": state.step,
+        "position": state.position,
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    save_file({n: t.contiguous() for n, t in tensors.items()}, temporary, metadata={"state": json.dumps(notes)})
+    temporary.replace(path)
+
+
+def read_checkpoint(path: Path) -> tuple[TrainState, dict[str, Any]]:
+    """State and facts written by ``write_checkpoint``.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            notes = json.loads(file.metadata()["state"])
+            tensors = {key: file.get_tensor(key) for key in file.keys()}
+        generator = torch.Generator()
+        generator.set_state(tensors["generator"])
+        state = TrainState(
+            counts=Counts(*notes["counts"]),
+            step=notes["step"],
+            position=notes["position"],
+            generator=generator,
+            neutral=_trained("neutral", tensors),
+            expression=_trained("expression", tensors),
+            driver=_trained("driver", tensors),
+            **{name: tensors[name] for name in _TENSORS},
+        )
+    except (SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
+        raise InputError(f"checkpoint {path} is damaged ({error})", "delete it to train from the start") from error
+    return state, notes
+
+
+def _named(group: str, trained: Trained) -> list[tuple[str, Tensor]]:
+    return [
+        (f"{group}.{part.name}.{field.name}", getattr(getattr(trained, part.name), field.name))
+        for part in fields(Trained)
+        for field in fields(GaussianParams)
+    ]
+
+
+def _trained(group: str, tensors: dict[str, Tensor]) -> Trained:
+    parts = {
+        part.name: GaussianParams(
+            **{field.name: tensors[f"{group}.{part.name}.{field.name}"] for field in fields(GaussianParams)}
+        )
+        for part in fields(Trained)
+    }
+    return Trained(**parts)

@@ -1,0 +1,120 @@
+"""One training step: blend, skin, render, compare, and send the gradient back.
+
+Only the rasteriser runs under autograd; blending, skinning and the losses have gradients by hand, so that a step
+allocates little and its work stays in the fused kernels. ``tests/train`` holds the same step written plainly.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from toonifygb.avatar import MouthVolume
+from toonifygb.avatar.fields import cut, join
+from toonifygb.avatar.skinner import Skinner, skinning_gradient
+from toonifygb.render import RenderInfo
+from toonifygb.structures import GaussianParams, Splats
+from toonifygb.train.losses import LossTerms, LossWeights, image_gradients, mouth_loss
+from toonifygb.train.optim import Coefficients, Optimizer, blend
+
+if TYPE_CHECKING:
+    from toonifygb.avatar import Avatar
+    from toonifygb.config import TrainConfig
+    from toonifygb.render import Renderer
+    from toonifygb.render.fused import Kernels
+    from toonifygb.structures import TrackedSequence
+    from toonifygb.train.data import Dataset
+    from toonifygb.train.state import TrainState
+
+SH_GROWTH = 40
+"""The active SH degree rises by one after every this-many-th part of the steps, from 0."""
+
+
+class Stepper:
+    """Takes steps of a training; everything that does not change from step to step is prepared here.
+
+    Args:
+        state: changed in place by ``step``.
+        template: the avatar's unchanging parts.
+        dataset: crops, mattes, cameras, split.
+        sequence: motion of every frame.
+        config: weights, degree, number of steps.
+        renderer: rasteriser.
+        kernels: fused blending, optimiser and photometric loss.
+    """
+
+    def __init__(
+        self,
+        state: TrainState,
+        template: Avatar,
+        dataset: Dataset,
+        sequence: TrackedSequence,
+        config: TrainConfig,
+        renderer: Renderer,
+        kernels: Kernels,
+    ) -> None:
+        self.state = state
+        self._dataset = dataset
+        self._config = config
+        self._renderer = renderer
+        self._kernels = kernels
+        self._weights = LossWeights.of(config)
+        self._mouth = MouthVolume.around(join([template.mouth_upper, template.mouth_lower]).means)
+        self._transforms = template.transforms(sequence.motion)
+        self._features = template.pose_feature(sequence.motion)
+        psi = template.coefficients(sequence.motion)
+        n_expression = template.n_expressions + template.n_eyelids
+        self._expression = psi[:, :n_expression].contiguous()
+        self._driver = psi[:, n_expression:].contiguous()
+        self.rebind()
+
+    def rebind(self) -> None:
+        """Prepares again what depends on the set of Gaussians; after densification."""
+        self._skinner = Skinner(self.state.skin_weights, self.state.pose_basis)
+        self._optimizer = Optimizer(self.state, self._config.steps, self._kernels)
+
+    @property
+    def sh_degree(self) -> int:
+        """Active SH degree."""
+        return min(self._config.sh_degree, self.state.step * SH_GROWTH // self._config.steps)
+
+    def step(self, info: RenderInfo | None = None) -> LossTerms:
+        """One step on the next frame; ``info`` is filled with the densification statistic when given."""
+        state = self.state
+        index = state.next_frame(self._dataset.split.train)
+        state.step += 1
+        psi = Coefficients(self._expression[index], self._driver[index])
+        gradient, terms = self._gradient(index, psi, info)
+        self._optimizer.step(state, gradient, psi)
+        return terms
+
+    def _gradient(self, index: int, psi: Coefficients, info: RenderInfo | None) -> tuple[GaussianParams, LossTerms]:
+        """Gradient of the whole objective for the blended raw parameters of one frame."""
+        raw = blend(self.state, psi, self._kernels)
+        posed = self._skinner(raw, self._transforms[index], self._features[index])
+        leaves, frames = _leaves(posed.splats), posed.splats.sh_frames
+        rendering = self._renderer.render(
+            Splats(*leaves, sh_frames=frames), self._dataset.camera(index), sh_degree=self.sh_degree, info=info
+        )
+        target, matte = self._dataset.target(index)
+        photo, alpha, v_color, v_alpha = image_gradients(rendering, target, matte, self._weights, self._kernels)
+        found = torch.autograd.grad([rendering.color, rendering.alpha], leaves, [v_color, v_alpha])
+        gradient = skinning_gradient(posed, Splats(*found))
+        return gradient, LossTerms(photo, alpha, self._add_mouth_gradient(gradient))
+
+    def _add_mouth_gradient(self, gradient: GaussianParams) -> float:
+        """Adds the mouth penalty's gradient in place; returns the penalty."""
+        counts, means = self.state.counts, self.state.neutral.values.means
+        places = [(counts.face, counts.face + counts.upper), (counts.face + counts.upper, counts.all)]
+        upper, lower = (means[start:stop].detach().requires_grad_() for start, stop in places)
+        loss = mouth_loss(upper, lower, self._mouth, self._weights)
+        for (start, stop), found in zip(places, torch.autograd.grad(loss, [upper, lower]), strict=True):
+            cut(gradient, start, stop).means.add_(found)
+        return float(loss.detach())
+
+
+def _leaves(splats: Splats) -> list[torch.Tensor]:
+    """What the rasteriser is differentiated in, cut from any graph."""
+    tensors = [splats.means, splats.quats, splats.scales, splats.opacities, splats.sh]
+    return [tensor.detach().requires_grad_() for tensor in tensors]

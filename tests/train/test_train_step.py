@@ -1,0 +1,272 @@
+"""The fast step against a plain one, resuming, and learning on a tiny synthetic clip."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import torch
+from make import TINY, tiny_avatar, tiny_head, tiny_motion, tiny_sequence
+
+from toonifygb import render
+from toonifygb.avatar import Avatar, MouthVolume
+from toonifygb.avatar.fields import FIELDS, each, join
+from toonifygb.avatar.skinner import Skinner, skinning_gradient
+from toonifygb.avatar.skinning import activate, blend_parameters, scale_deltas
+from toonifygb.errors import InputError
+from toonifygb.progress import Stopped
+from toonifygb.structures import GaussianParams, Splats, TrackedSequence
+from toonifygb.train import Dataset, build_dataset, comparison, evaluate, first_avatar, train
+from toonifygb.train.losses import LossWeights, image_loss, mouth_loss
+from toonifygb.train.optim import DELTA_RATES, FULL_STEPS, NEUTRAL_RATES, means_decay, settling
+from toonifygb.train.state import TrainState, read_checkpoint, write_checkpoint
+from toonifygb.train.step import Stepper
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, TrackedSequence]:
+    """Renders of a random avatar on the tiny head, cut into a training set."""
+    sequence, truth = tiny_sequence(20, 64), tiny_avatar(n=400, seed=7)
+    truth = replace(truth, neutral=replace(truth.neutral, opacity_logits=truth.neutral.opacity_logits + 2))
+    renderer = render.get("auto", 1)
+
+    def pairs():
+        with torch.no_grad():
+            for index in range(sequence.n_frames):
+                image = renderer.render(truth.pose(sequence.motion[index]), sequence.camera)
+                color = image.color / image.alpha.clamp_min(1e-3)[..., None]
+                yield (color.clamp(0, 1) * 255).round().to(torch.uint8).numpy(), image.alpha.clamp(0, 1).numpy()
+
+    folder = tmp_path_factory.mktemp("clip")
+    return build_dataset(pairs(), sequence, tiny_head(), TINY, folder), sequence
+
+
+def same(a: Avatar, b: Avatar) -> bool:
+    names = ("neutral", "deltas", "mouth_upper", "mouth_lower")
+    return all(torch.equal(getattr(getattr(a, n), f), getattr(getattr(b, n), f)) for n in names for f in FIELDS)
+
+
+def test_skinner_equals_the_definition() -> None:
+    avatar = tiny_avatar().to(torch.float64)
+    motion = tiny_motion()[7].to(torch.float64)
+    raw = blend_parameters(avatar.neutral, avatar.deltas, avatar.coefficients(motion))
+    raw = join([raw, avatar.mouth_upper, avatar.mouth_lower])
+    weights = [avatar.skin_weights]
+    weights += [row.expand(20, -1) for row in (avatar.mouth_upper_weights, avatar.mouth_lower_weights)]
+    skinner = Skinner(torch.cat(weights), avatar.pose_basis)
+    fast = skinner(raw, avatar.transforms(motion), avatar.pose_feature(motion)).splats
+    slow = avatar.pose(motion)
+    for name in ("means", "scales", "opacities", "sh", "sh_frames"):
+        # A Gaussian bound to one joint by all but a millionth takes that joint's rotation as its own.
+        assert (getattr(fast, name) - getattr(slow, name)).abs().max() < 1e-6, name
+    turned = torch.minimum((fast.quats - slow.quats).abs(), (fast.quats + slow.quats).abs())
+    assert turned.max() < 1e-6
+
+
+def test_skinning_gradient_by_hand_equals_autograd() -> None:
+    avatar = tiny_avatar().to(torch.float64)
+    motion = tiny_motion()[3].to(torch.float64)
+    raw = avatar.neutral.map(lambda t: t.clone().requires_grad_())
+    skinner = Skinner(avatar.skin_weights, avatar.pose_basis)
+    transforms, feature = avatar.transforms(motion), avatar.pose_feature(motion)
+    posed = skinner(raw, transforms, feature)
+    upstream = [torch.randn_like(t) for t in (posed.splats.means, posed.splats.quats, posed.splats.scales)]
+    upstream += [torch.randn_like(posed.splats.opacities), torch.randn_like(posed.splats.sh)]
+    outputs = [posed.splats.means, posed.splats.quats, posed.splats.scales, posed.splats.opacities, posed.splats.sh]
+    torch.autograd.backward(outputs, upstream)
+    found = skinning_gradient(posed, Splats(*upstream))
+    for name, value in each(found):
+        assert (value - getattr(raw, name).grad).abs().max() < 1e-10, name
+
+
+class PlainTraining:
+    """The training written with autograd, ``Avatar.pose`` and ``torch.optim.Adam``."""
+
+    def __init__(self, template: Avatar) -> None:
+        self.state = TrainState.start(template, TINY.seed)
+        self.template = template
+        n_expression = template.n_expressions + template.n_eyelids
+        self.scale = torch.ones(len(template.blendshape_names), self.state.counts.face)
+        self.scale[:n_expression] = 0.0
+        self.scale[:n_expression, : self.state.counts.moved] = self.state.scale
+        sets = [template.neutral, template.mouth_upper, template.mouth_lower]
+        self.sets = [part.map(lambda t: t.clone().requires_grad_()) for part in sets]
+        self.trained = template.deltas.map(lambda t: torch.zeros_like(t).requires_grad_())
+        self.groups = []
+        for name in FIELDS:
+            key = "sh_dc" if name == "sh" else name
+            faster = FULL_STEPS / TINY.steps if name in {"means", "opacity_logits"} else 1
+            self.add([getattr(part, name) for part in self.sets], NEUTRAL_RATES[key], settles=name != "means")
+            self.add([getattr(self.trained, name)], DELTA_RATES[key] * faster, settles=True)
+        self.adam = torch.optim.Adam([dict(group) for group in self.groups], eps=1e-15)
+        self.volume = MouthVolume.around(join([template.mouth_upper, template.mouth_lower]).means)
+
+    def add(self, tensors: list[torch.Tensor], rate: float, *, settles: bool) -> None:
+        self.groups.append({"params": tensors, "lr": rate, "settles": settles})
+
+    def deltas(self) -> GaussianParams:
+        scaled = scale_deltas(self.trained, self.scale)
+        fixed = self.template.deltas
+        return GaussianParams(**{name: getattr(fixed, name) + getattr(scaled, name) for name in FIELDS})
+
+    def step(self, dataset: Dataset, sequence: TrackedSequence) -> None:
+        index = self.state.next_frame(dataset.split.train)
+        self.state.step += 1
+        neutral, upper, lower = self.sets
+        avatar = replace(self.template, neutral=neutral, mouth_upper=upper, mouth_lower=lower, deltas=self.deltas())
+        image = render.get("auto", 1).render(
+            avatar.pose(sequence.motion[index]), dataset.camera(index), sh_degree=0
+        )
+        weights = LossWeights.of(TINY)
+        loss = image_loss(image, *dataset.target(index), weights)
+        loss = loss + mouth_loss(upper.means, lower.means, self.volume, weights)
+        self.adam.zero_grad()
+        loss.backward()
+        share = self.state.step / TINY.steps
+        for group, first in zip(self.adam.param_groups, self.groups, strict=True):
+            group["lr"] = first["lr"] * (settling(share) if group["settles"] else means_decay(share))
+        self.adam.step()
+
+
+class DegreeZero(Stepper):
+    """A stepper whose view-dependent colour never grows: then only the DC coefficients have gradients."""
+
+    sh_degree = 0  # type: ignore[assignment]
+
+
+def test_fast_step_equals_the_plain_one(clip: tuple[Dataset, TrackedSequence]) -> None:
+    """Two steps, every parameter."""
+    dataset, sequence = clip
+    template = first_avatar(dataset, sequence, tiny_head(), TINY)
+    # Round Gaussians have no gradient for their rotation, and unturned ones none for w, but rounding noise, of
+    # which Adam keeps the sign.
+    stretched = template.neutral.log_scales + torch.tensor([0.4, 0.0, -0.4])
+    turned = template.neutral.quats + torch.tensor([0.3, 0.5, -0.4, 0.2])
+    template = replace(template, neutral=replace(template.neutral, log_scales=stretched, quats=turned))
+    state, plain = TrainState.start(template, TINY.seed), PlainTraining(template)
+    first = join([template.neutral, template.mouth_upper, template.mouth_lower])
+    stepper = DegreeZero(state, template, dataset, sequence, TINY, render.get("auto", 1), render.kernels("auto", 1))
+    for _ in range(2):
+        stepper.step()
+        plain.step(dataset, sequence)
+    n_face, n_expression = state.counts.face, template.n_expressions + template.n_eyelids
+    wanted, applied = join(plain.sets), plain.deltas()
+    groups = {
+        "neutral": (state.neutral.values, wanted, first, n_face),
+        "driver": (
+            state.driver.values,
+            applied.map(lambda t: t[n_expression:]),
+            template.deltas.map(lambda t: t[n_expression:]),
+            None,
+        ),
+        "expression": (
+            state.expression.values,
+            applied.map(lambda t: t[:n_expression, : state.counts.moved]),
+            template.deltas.map(lambda t: t[:n_expression, : state.counts.moved]),
+            None,
+        ),
+    }
+    for group, (ours, theirs, start, n) in groups.items():
+        for name in FIELDS:
+            origin = getattr(start, name)[:n]
+            moved, expected = ((getattr(p, name)[:n] - origin).detach() for p in (ours, theirs))
+            # A step is ± the rate, so where the gradient is nearly 0 float32 may choose the other sign.
+            wrong = ((moved - expected).abs() > 0.02 * expected.abs().max()).float().mean()
+            assert wrong < 0.02, (group, name, float(wrong))
+            assert (expected != 0).any(), (group, name)
+
+
+def test_resumed_training_equals_a_straight_one(clip: tuple[Dataset, TrackedSequence], tmp_path: Path) -> None:
+    dataset, sequence = clip
+
+    class StopAt:
+        def __init__(self, step: int) -> None:
+            self.step = step
+
+        def update(self, done: int, total: int | None, **figures: float) -> None:
+            if done == self.step:
+                raise Stopped
+
+    def run(folder: Path, stop: int | None = None) -> Avatar | None:
+        progress = StopAt(stop or -1)
+        return train(dataset, sequence, tiny_head(), replace(TINY, steps=20), folder, threads=2, progress=progress)
+
+    straight = run(tmp_path / "straight")
+    for stop in (1, 10):
+        with pytest.raises(Stopped):
+            run(tmp_path / "paused", stop)
+    paused = run(tmp_path / "paused")
+    assert straight is not None and paused is not None
+    assert same(straight, paused)
+    finished_again = run(tmp_path / "paused")
+    assert finished_again is not None and same(straight, finished_again)
+
+
+def test_checkpoint_round_trip_and_damage(clip: tuple[Dataset, TrackedSequence], tmp_path: Path) -> None:
+    dataset, sequence = clip
+    state = TrainState.start(first_avatar(dataset, sequence, tiny_head(), TINY), 5)
+    state.next_frame(dataset.split.train)
+    path = tmp_path / "checkpoint.safetensors"
+    write_checkpoint(state, path, {"fingerprint": "x"})
+    again, facts = read_checkpoint(path)
+    assert facts["fingerprint"] == "x"
+    frames = [[s.next_frame(dataset.split.train) for _ in range(40)] for s in (state, again)]
+    assert frames[0] == frames[1]
+    assert torch.equal(state.expression.values.sh, again.expression.values.sh)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(InputError, match="damaged"):
+        read_checkpoint(path)
+
+
+def test_another_training_does_not_continue_a_checkpoint(
+    clip: tuple[Dataset, TrackedSequence], tmp_path: Path
+) -> None:
+    dataset, sequence = clip
+    short = replace(TINY, steps=3)
+    train(dataset, sequence, tiny_head(), short, tmp_path)
+    other = train(dataset, sequence, tiny_head(), replace(short, seed=1), tmp_path)
+    fresh = train(dataset, sequence, tiny_head(), replace(short, seed=1), tmp_path / "fresh")
+    assert same(other, fresh)
+
+
+def test_every_epoch_takes_each_frame_once(clip: tuple[Dataset, TrackedSequence]) -> None:
+    dataset, sequence = clip
+    state = TrainState.start(first_avatar(dataset, sequence, tiny_head(), TINY), 0)
+    frames = dataset.split.train
+    epochs = [[state.next_frame(frames) for _ in frames] for _ in range(3)]
+    assert all(sorted(epoch) == sorted(frames) for epoch in epochs)
+    assert epochs[0] != epochs[1]
+
+
+def test_training_learns(clip: tuple[Dataset, TrackedSequence], tmp_path: Path) -> None:
+    """The loss falls and the score on frames never trained on rises by several decibels."""
+    dataset, sequence = clip
+    before = first_avatar(dataset, sequence, tiny_head(), TINY)
+    after = train(dataset, sequence, tiny_head(), replace(TINY, steps=250), tmp_path)
+    scores = [evaluate(avatar, dataset, sequence, dataset.split.test) for avatar in (before, after)]
+    assert scores[1]["psnr"] > scores[0]["psnr"] + 4
+    assert scores[1]["ssim"] > scores[0]["ssim"] + 0.05
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [50, 100, 150, 200, 250]
+    assert lines[-1]["loss"] < 0.5 * lines[0]["loss"]
+
+
+def test_scores_are_jsonable_and_complete(clip: tuple[Dataset, TrackedSequence]) -> None:
+    dataset, sequence = clip
+    avatar = first_avatar(dataset, sequence, tiny_head(), TINY)
+    scores = json.loads(json.dumps(evaluate(avatar, dataset, sequence, dataset.split.test)))
+    assert scores["lpips"] is None
+    assert scores["frames"] == list(dataset.split.test)
+    assert len(scores["psnr_per_frame"]) == len(dataset.split.test)
+    assert abs(np.mean(scores["psnr_per_frame"]) - scores["psnr"]) < 1e-3
+    assert abs(scores["psnr_per_channel"] - scores["psnr"]) < 1
+    picture = comparison(avatar, dataset, sequence, dataset.split.test[:2])
+    assert picture.shape == (2 * dataset.size, 3 * dataset.size, 3)
+    assert picture[:, : dataset.size].max() > 100
+    assert activate(avatar.neutral).opacities.max() < 0.2
