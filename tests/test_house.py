@@ -219,7 +219,7 @@ def test_rules_notice(rule, place: str, text: str):
         ("cli/x.py", "from toonifygb import __version__\nprint(__version__)"),
         (
             "train/x.py",
-            "raise InputError('no frames')\nerror = Stopped('x')\nzip(a, b, strict=False)\ntorch.cuda.is_available()",
+            "raise InputError('no frames')\nlate = Stopped()\nzip(a, b, strict=False)\ntorch.cuda.is_available()",
         ),
     ],
 )
