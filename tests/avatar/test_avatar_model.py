@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 from make import TINY, tiny_avatar, tiny_head, tiny_motion
 
-from toonifygb.avatar import POSE_DRIVERS, MouthVolume, init_avatar
+from toonifygb.avatar import POSE_DRIVERS, MouthVolume, Poser, init_avatar
 from toonifygb.avatar.fields import each
 from toonifygb.avatar.init import nearest_squared
 from toonifygb.avatar.skinning import activate, blend_parameters, concatenate, skin_splats
@@ -210,3 +211,14 @@ def test_consistency_is_zero_where_the_surface_rests() -> None:
     assert scale[1] == 0
     assert abs(scale[2] - 1) < 1e-6
     assert scale[3] > 3
+
+
+@pytest.mark.parametrize(("half", "tolerance"), [(False, 2e-6), (True, 5e-3)])
+def test_poser_equals_the_definition(half: bool, tolerance: float) -> None:
+    avatar = tiny_avatar()
+    poser = Poser(avatar, half=half)
+    for index in (0, 7):
+        fast, slow = poser(tiny_motion()[index]), avatar.pose(tiny_motion()[index])
+        for name in ("means", "scales", "opacities", "sh", "sh_frames"):
+            # bfloat16 keeps 8 bits of the deltas, of which the largest here are SH of about 0.1.
+            assert (getattr(fast, name) - getattr(slow, name)).abs().max() < tolerance, name

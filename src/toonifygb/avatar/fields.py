@@ -57,3 +57,11 @@ def extended(deltas: GaussianParams, n: int) -> GaussianParams:
 def rows(tensor: Float[Tensor, "k n *c"]) -> Float[Tensor, "k p"]:
     """Deltas of one field as the matrix that the kernels stream through; a view."""
     return tensor.view(tensor.shape[0], -1)
+
+
+def last_changed(deltas: GaussianParams) -> int:
+    """Number of the first Gaussians after which no delta changes anything."""
+    changes = torch.zeros(deltas.opacity_logits.shape[1], dtype=torch.bool)
+    for _, delta in each(deltas):
+        changes |= (delta != 0).flatten(2).any(-1).any(0) if delta.ndim > 2 else (delta != 0).any(0)
+    return int(changes.nonzero().max()) + 1 if bool(changes.any()) else 0

@@ -19,6 +19,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
+from toonifygb.avatar.fields import cut_deltas, extended, last_changed
 from toonifygb.avatar.model import Avatar, PoseDrivers
 from toonifygb.errors import InputError
 from toonifygb.structures import Camera, GaussianParams, HeadMotion, TensorRecord
@@ -90,23 +91,7 @@ def load(folder: Path | str) -> Avatar:
 
 def _trimmed(avatar: Avatar) -> Avatar:
     """The avatar with deltas cut after the last Gaussian that any of them changes (one is always kept)."""
-    moves = torch.zeros(avatar.neutral.n, dtype=torch.bool)
-    for part in fields(avatar.deltas):
-        delta = getattr(avatar.deltas, part.name)
-        moves |= (delta != 0).flatten(2).any(-1).any(0) if delta.ndim > 2 else (delta != 0).any(0)
-    last = int(moves.nonzero().max()) + 1 if bool(moves.any()) else 1
-    return replace(avatar, deltas=avatar.deltas.map(lambda delta: delta[:, :last]))
-
-
-def _padded(deltas: GaussianParams, n: int) -> GaussianParams:
-    """Inverse of ``_trimmed``: float32 deltas of all n Gaussians."""
-
-    def pad(delta: Tensor) -> Tensor:
-        full = torch.zeros(delta.shape[0], n, *delta.shape[2:])
-        full[:, : delta.shape[1]] = delta
-        return full
-
-    return deltas.map(pad)
+    return replace(avatar, deltas=cut_deltas(avatar.deltas, 0, max(1, last_changed(avatar.deltas))))
 
 
 def _tensors(avatar: Avatar) -> dict[str, Tensor]:
@@ -187,7 +172,7 @@ def _assemble(tensors: dict[str, Tensor], facts: dict[str, Any], path: Path) -> 
     for name, kind in records.items():
         parts = {p.name: tensors[f"{name}.{p.name}"] for p in fields(kind) if f"{name}.{p.name}" in tensors}
         built[name] = kind(**parts, **extra.get(name, {}))
-    built["deltas"] = _padded(built["deltas"], facts["n_gaussians"])
+    built["deltas"] = extended(built["deltas"].to(torch.float32), facts["n_gaussians"])
     built.setdefault("drivers", None)
     avatar = Avatar(
         **built,

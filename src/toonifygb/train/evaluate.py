@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from toonifygb import render
+from toonifygb.avatar import Poser
 from toonifygb.metrics import psnr, psnr_per_channel, ssim
 from toonifygb.progress import SILENT
 
@@ -49,12 +50,12 @@ def evaluate(
         threads: of the native engine.
         progress: told after every frame.
     """
-    renderer = render.get(backend, threads)
+    renderer, poser = render.get(backend, threads), Poser(avatar, backend=backend, threads=threads)
     table: dict[str, list[float]] = {"psnr": [], "psnr_per_channel": [], "ssim": []}
     with torch.no_grad():
         for done, index in enumerate(frames, start=1):
             target, _ = dataset.target(index)
-            image = renderer.render(avatar.pose(sequence.motion[index]), dataset.camera(index)).color.clamp(0, 1)
+            image = renderer.render(poser(sequence.motion[index]), dataset.camera(index)).color.clamp(0, 1)
             for name, measure in (("psnr", psnr), ("psnr_per_channel", psnr_per_channel), ("ssim", ssim)):
                 table[name].append(float(measure(image, target)))
             progress.update(done, len(frames))
@@ -73,12 +74,12 @@ def comparison(
     threads: int | None = None,
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Picture grid, one row per frame: photo on black, render, four-fold absolute difference."""
-    renderer = render.get(backend, threads)
+    renderer, poser = render.get(backend, threads), Poser(avatar, backend=backend, threads=threads)
     rows = []
     with torch.no_grad():
         for index in frames:
             target, _ = dataset.target(index)
-            image = renderer.render(avatar.pose(sequence.motion[index]), dataset.camera(index)).color.clamp(0, 1)
+            image = renderer.render(poser(sequence.motion[index]), dataset.camera(index)).color.clamp(0, 1)
             error = ((image - target).abs() * _ERROR_GAIN).clamp_max(1)
             rows.append(torch.cat([target, image, error], dim=1))
     return _to_uint8(torch.cat(rows))

@@ -1,0 +1,67 @@
+"""Posing for playback: the splats of ``Avatar.pose``, through the fused kernels and with everything prepared."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from toonifygb import render
+from toonifygb.avatar.fields import cut, cut_deltas, each, join, last_changed, rows
+from toonifygb.avatar.skinner import Skinner
+from toonifygb.structures import GaussianParams
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+    from toonifygb.avatar.model import Avatar
+    from toonifygb.structures import HeadMotion, Splats
+
+
+class Poser:
+    """Poses one avatar many times.
+
+    Args:
+        avatar: float32, on the CPU.
+        backend: of the kernels: ``auto``, ``native`` or ``reference``.
+        threads: of the native engine.
+        half: keep the deltas as bfloat16: half the memory traffic, which is what blending costs.
+    """
+
+    def __init__(
+        self, avatar: Avatar, *, backend: str = "auto", threads: int | None = None, half: bool = False
+    ) -> None:
+        self._avatar = avatar
+        self._kernels = render.kernels(backend, threads)
+        self._neutral = join([avatar.neutral, avatar.mouth_upper, avatar.mouth_lower])
+        weights = [avatar.skin_weights]
+        weights.append(avatar.mouth_upper_weights.expand(avatar.mouth_upper.n, -1))
+        weights.append(avatar.mouth_lower_weights.expand(avatar.mouth_lower.n, -1))
+        self._skinner = Skinner(torch.cat(weights), avatar.pose_basis)
+        self._n_expression = avatar.n_expressions + avatar.n_eyelids
+        dtype = torch.bfloat16 if half else torch.float32
+        expression = cut(avatar.deltas, 0, self._n_expression)
+        driver = avatar.deltas.map(lambda delta: delta[self._n_expression :])
+        groups = [cut_deltas(group, 0, last_changed(group)) for group in (expression, driver)]
+        self._groups = [group.map(lambda delta: delta.to(dtype).contiguous()) for group in groups]
+
+    def __call__(self, motion: HeadMotion) -> Splats:
+        """Splats in the world for one frame's motion, as ``Avatar.pose`` gives them; without gradients."""
+        with torch.no_grad():
+            psi = self._avatar.coefficients(motion)
+            raw = self._blend([psi[: self._n_expression].contiguous(), psi[self._n_expression :].contiguous()])
+            transforms, feature = self._avatar.transforms(motion), self._avatar.pose_feature(motion)
+            return self._skinner(raw, transforms, feature).splats
+
+    def _blend(self, coefficients: list[Float[Tensor, " k"]]) -> GaussianParams:
+        blended = {}
+        for name, neutral in each(self._neutral):
+            values = neutral.clone()
+            for group, psi in zip(self._groups, coefficients, strict=True):
+                deltas = rows(getattr(group, name))
+                if deltas.numel():
+                    base = values.view(-1)[: deltas.shape[1]]
+                    base.copy_(self._kernels.blend(base, deltas, psi))
+            blended[name] = values
+        return GaussianParams(**blended)
