@@ -26,6 +26,7 @@ OVAL = (10, 338, 297, 332, 284, 251, 389, 356, 454, 323, 361, 288, 397, 365, 379
 OVAL += (150, 136, 172, 58, 132, 93, 234, 127, 162, 21, 54, 103, 67, 109)
 LIPS = (61, 146, 91, 181, 84, 17, 314, 405, 321, 375, 291, 409, 270, 269, 267, 0, 37, 39, 40, 185)
 MOUTH = (78, 95, 88, 178, 87, 14, 317, 402, 318, 324, 308, 415, 310, 311, 312, 13, 82, 81, 80, 191)
+LIP_LINE = (78, 191, 80, 81, 82, 13, 312, 311, 310, 415, 308)
 CHEEKS = (50, 280)
 JAW_LINE = (132, 58, 172, 136, 150, 149, 176, 148, 152, 377, 400, 378, 379, 365, 397, 288, 361)
 NOSE_BASE = (129, 98, 97, 2, 326, 327, 358)
@@ -254,6 +255,6 @@ def frontal(faces: Faces) -> Float[np.ndarray, "478 2"]:
 
 
 def anatomy(shape: tuple[int, int], points: Points, unit: float) -> Plane:
-    """Where a draughtsman looks for lines even if the picture shows them faintly: jaw and nose; 0..1.5."""
-    lines = [points[list(JAW_LINE)], points[list(NOSE_BASE)]]
-    return np.float32(1.5) * mask(shape, lines, 0.02 * unit, 0.05 * unit)
+    """Where a draughtsman looks for lines even if the picture shows them faintly: jaw, nose, between the lips."""
+    lines = [points[list(JAW_LINE)], points[list(NOSE_BASE)], points[list(LIP_LINE)]]
+    return np.float32(1.8) * mask(shape, lines, 0.02 * unit, 0.05 * unit)

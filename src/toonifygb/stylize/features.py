@@ -80,15 +80,16 @@ def _bright_eye(detail: Picture, points: Points, eye: Eye, opening: Plane) -> Pi
 
     disc = 1.0 - smoothstep(1.0 - soft, 1.0 + soft, ring(0.0, 0.0))
     white = opening * (1.0 - disc) * smoothstep(30.0, 60.0, detail[..., 0])
-    inner = disc * opening
-    core = opening * (1.0 - smoothstep(0.36, 0.52, ring(0.0, 0.0)))
+    dark = 1.0 - smoothstep(40.0, 62.0, detail[..., 0])  # where the landmarks miss the iris, its white stays white
+    inner = disc * opening * dark
+    core = opening * dark * (1.0 - smoothstep(0.36, 0.52, ring(0.0, 0.0)))
     below = smoothstep(-0.6, 0.9, (grid[..., 1] - iris[1]) / radius)
     tone = mix(detail[..., 0], 93.0, 0.55 * white) + inner * (22.0 * below - 6.0)
     chroma = (1.0 - 0.6 * white) * (1.0 + 0.5 * inner)
     out = cv2.merge([mix(tone, 7.0, 0.85 * core), detail[..., 1] * chroma, detail[..., 2] * chroma])
     for dx, dy, size, power in CATCH_LIGHTS:
         spark = 1.0 - smoothstep(size - 0.5 * soft, size + soft, ring(dx, dy))
-        out = mix(out, np.array([99.0, 0.0, 0.0], np.float32), power * spark * opening)
+        out = filters.tint(out, np.array([99.0, 0.0, 0.0], np.float32), power * spark * opening)
     return out
 
 
@@ -151,7 +152,7 @@ def draw_lashes(rgb: Picture, points: Points, presence: float, unit: float, ink:
         plane = np.zeros(rgb[box].shape[:2], np.uint8)
         anchors.draw(plane, stroke)
         amount = plane.astype(np.float32) * np.float32(0.9 * presence / 255)
-        rgb[box] = mix(rgb[box], ink, blur(amount, 0.003 * unit))
+        rgb[box] = filters.tint(rgb[box], ink, blur(amount, 0.003 * unit))
 
 
 def _lash(lid: Points, unit: float, steps: int = 48) -> Points:

@@ -79,6 +79,12 @@ def mix(first: np.ndarray, second: np.ndarray | float, amount: np.ndarray | floa
     return first + (second - first) * amount
 
 
+def tint(picture: Picture, colour: Float[np.ndarray, " c"], amount: Plane) -> Picture:
+    """``picture`` with one colour laid over it; as ``mix``, channel by channel, which is faster."""
+    channels = (picture[..., index] for index in range(picture.shape[2]))
+    return cv2.merge([plane + (value - plane) * amount for plane, value in zip(channels, colour, strict=True)])
+
+
 def spread(plane: Plane, channels: int) -> Picture:
     """The plane repeated for every channel: arithmetic on whole pictures is several times faster than numpy's
     broadcasting along so short an axis.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 
 from toonifygb.stylize import features, filters, textures
@@ -30,7 +31,9 @@ PAPER = np.array([0.975, 0.960, 0.925], np.float32)
 INK = np.array([0.10, 0.10, 0.15], np.float32)
 """sRGB of the pen: blue-black."""
 WASH = np.array([0.66, 0.69, 0.74], np.float32)
-"""sRGB of one coat of diluted ink on the sheet."""
+"""Share of light that comes back through a full coat of diluted ink."""
+PALETTE = tuple(zip(PAPER.tolist(), (PAPER * WASH).tolist(), INK.tolist(), strict=True))
+"""Paper, wash and pen for each channel."""
 HATCH_PERIOD = 0.028
 """Distance of two hatching lines in face widths."""
 HATCH_ANGLES = (0.95, -0.65)
@@ -75,11 +78,14 @@ class Ink:
         fields = _tone_and_lines(lab, points * scale, presence, state["unit"] * scale)
         fields = filters.resize(fields, width, height)
         darkness = 1.0 - fields[..., 0] / np.float32(state["light"])
+        darkness *= 1.0 + 0.4 * fields[..., 2]  # eyes, brows and mouth are drawn with a fuller pen
         if matte is not None:
             darkness = mix(0.35 * darkness, darkness, matte)
-        rgb = _toned(darkness, fields[..., 2], points, presence, state)
-        line = smoothstep(1.1, 2.8, fields[..., 1])
-        rgb = mix(rgb, INK, 0.95 * line)
+        bare, coats = np.ones((height, width), np.float32), _wash(darkness)
+        bare *= 1.0 - _hatching(darkness, fields[..., 2], points, presence, state)
+        bare *= 1.0 - 0.96 * smoothstep(0.66, 0.74, darkness)
+        bare *= 1.0 - 0.95 * smoothstep(1.1, 2.8, fields[..., 1])
+        rgb = cv2.merge([(paper - (paper - wash) * coats - ink) * bare + ink for paper, wash, ink in PALETTE])
         if presence > 0:
             features.draw_lashes(rgb, points, presence, state["unit"], INK)
         return filters.to_bytes(rgb + _paper((height, width)))
@@ -99,37 +105,41 @@ def _tone_and_lines(lab: Lab, points: Points, presence: float, unit: float) -> n
     return np.dstack([simple, response, np.zeros_like(simple)])
 
 
-def _toned(darkness: Plane, keep: Plane, points: Points, presence: float, state: dict[str, Any]) -> np.ndarray:
-    """Paper with wash, hatching and solid blacks for darkness 0 (skin in the light) .. 1 (black); no hatching
-    over eyes and mouth (``keep``), which have tones of their own.
-    """
+def _wash(darkness: Plane) -> Plane:
+    """Coats of diluted ink for darkness 0 (skin in the light) .. 1 (black)."""
+    return 0.42 * smoothstep(0.10, 0.16, darkness) + 0.42 * smoothstep(0.34, 0.42, darkness)
+
+
+def _hatching(darkness: Plane, keep: Plane, points: Points, presence: float, state: dict[str, Any]) -> Plane:
+    """Share 0..1 of ink laid by hatching; none over eyes and mouth (``keep``), which have tones of their own."""
     shape, unit = darkness.shape, state["unit"]
-    first = smoothstep(0.10, 0.16, darkness)
-    second = smoothstep(0.34, 0.42, darkness)
-    rgb = PAPER * (1.0 - (1.0 - WASH) * (0.42 * first + 0.42 * second)[..., None])
-    share = textures.head_share(shape, points, presence, unit) if presence > 0 else None
+    bare = np.ones(shape, np.float32)
+    on_head = textures.head_share(shape, points, presence, unit) > 0.5 if presence > 0 else None
     place = textures.head_place(points, state["template"]) if presence > 0 else textures.IDENTITY
     for angle, start in zip(HATCH_ANGLES, (0.22, 0.46), strict=True):
+        phase = _hatch_phase(shape, textures.IDENTITY, angle, unit)
+        if on_head is not None:
+            phase = np.where(on_head, _hatch_phase(shape, place, angle, unit), phase)
+        distance = np.abs(phase - np.rint(phase)) * 2.0  # 0 on a line, 1 half way between two
         cover = 0.75 * smoothstep(start, start + 0.45, darkness) + 0.16 * smoothstep(start, start + 0.04, darkness)
-        lines = _hatch(textures.IDENTITY, angle, unit, cover)
-        if share is not None:
-            lines = mix(lines, _hatch(place, angle, unit, cover), smoothstep(0.4, 0.6, share))
-        rgb = mix(rgb, INK, 0.8 * lines * (1.0 - keep))
-    return mix(rgb, INK, 0.96 * smoothstep(0.66, 0.74, darkness))
+        edge = 1.6 / _period(unit)  # one px of anti-aliasing, in these units
+        lines = smoothstep(-edge, edge, cover - distance) * np.minimum(cover * 8.0, 1.0)
+        bare *= 1.0 - 0.8 * lines * (1.0 - keep)
+    return 1.0 - bare
 
 
-def _hatch(place: Float[np.ndarray, "2 3"], angle: float, unit: float, cover: Plane) -> Plane:
-    """Slightly wavering parallel lines whose thickness is the share ``cover`` of the sheet they ink."""
-    height, width = cover.shape
-    period = max(HATCH_PERIOD * unit, 3.0)
-    waver = textures.laid(cover.shape, textures.noise_tile(8.0, 13), place, 45.0 / max(unit, 1.0))
-    x, y, start = np.array([np.cos(angle), np.sin(angle)]) @ place / period
-    columns = (x * np.arange(width)).astype(np.float32)
-    rows = (y * np.arange(height) + start).astype(np.float32)
-    phase = rows[:, None] + columns + np.float32(0.22) * waver
-    distance = np.abs(phase - np.rint(phase)) * 2.0  # 0 on a line, 1 half way between two
-    edge = 1.6 / period  # one px of anti-aliasing, in these units
-    return smoothstep(-edge, edge, cover - distance) * np.minimum(cover * 8.0, 1.0)
+def _period(unit: float) -> float:
+    """Distance of two hatching lines in px; never finer than the pixels can show."""
+    return max(HATCH_PERIOD * unit, 3.0)
+
+
+def _hatch_phase(shape: tuple[int, int], place: Float[np.ndarray, "2 3"], angle: float, unit: float) -> Plane:
+    """Number of the line at each pixel, with fractions, on a sheet that lies at ``place``; slightly wavering."""
+    waver = textures.laid(shape, textures.noise_tile(8.0, 13), place, 45.0 / max(unit, 1.0))
+    x, y, start = np.array([np.cos(angle), np.sin(angle)]) @ place / _period(unit)
+    columns = (x * np.arange(shape[1])).astype(np.float32)
+    rows = (y * np.arange(shape[0]) + start).astype(np.float32)
+    return rows[:, None] + columns + np.float32(0.22) * waver
 
 
 @functools.lru_cache(maxsize=2)

@@ -74,7 +74,7 @@ class Paint:
         dabs = filters.kuwahara(dabs, tangents, clarity, 0.03 * unit)
         if presence > 0:
             keep = feature_mask(lab.shape[:2], points * scale, unit) * np.float32(presence)
-            finer = filters.kuwahara(lab, tangents, clarity, 0.016 * unit)
+            finer = filters.kuwahara(lab, tangents, clarity, 0.011 * unit)
             dabs = mix(dabs, finer, keep)
         relief = _relief(lab.shape[:2], points * scale, presence, tangents, unit, state["template"] * scale)
         fields = filters.resize(np.dstack([dabs, relief]), width, height)

@@ -61,8 +61,9 @@ class Toon:
             "unit": unit,
             "has_skin": has_skin,
             "skin": [float(value) for value in middle],
+            "chroma": float(np.clip(26.0 / max(float(np.hypot(*middle[1:])), 1.0), 1.1, 1.35)),
             "tone_curve": filters.band_curve(levels, 1.6, 0.35, (float(middle[0]), gain)),
-            "skin_curve": filters.band_curve(skin_levels, 1.2, 0.25, (float(middle[0]) - 6.0, 1.2)),
+            "skin_curve": filters.band_curve(skin_levels, 1.2, 0.25, (float(middle[0]) - 12.0, 1.2)),
         }
 
     def apply(self, frames: Frames, faces: Faces, mattes: Any, state: dict[str, Any]) -> Frames:
@@ -85,7 +86,7 @@ class Toon:
             features.draw_toon_features(painted, frame, points, presence, state["unit"])
         line = smoothstep(1.5, 3.6, fields[..., 4])
         rgb = filters.to_rgb(painted)
-        rgb = mix(rgb, INK + 0.12 * rgb, 0.92 * line)
+        rgb = filters.tint(rgb, INK, 0.86 * line)  # the rest of the colour shines through
         if presence > 0:
             features.draw_lashes(rgb, points, presence, state["unit"], INK)
         return filters.to_bytes(rgb)
@@ -96,23 +97,35 @@ def _simplified(lab: Lab, points: Points, presence: float, state: dict[str, Any]
     tangents, clarity = filters.structure(lab, 0.012 * unit)
     simple = filters.kuwahara(lab, tangents, clarity, 0.03 * unit)
     fine = lab - simple
-    amount = np.sqrt(filters.dot(fine, fine))
-    simple += fine * filters.spread(smoothstep(7.0, 16.0, blur(amount, 0.006 * unit)), 3)
+    stands_out = filters.flow_blur(np.sqrt(filters.dot(fine, fine)), tangents, 0.02 * unit)
+    sharp = smoothstep(4.5, 10.0, stands_out)
     skin = np.zeros(lab.shape[:2], np.float32)
     if state["has_skin"]:
-        colour = blur(simple, 0.02 * unit)
-        difference = colour[..., 1:] - np.float32(state["skin"][1:])
-        away = filters.dot(difference, difference)
-        lit = smoothstep(0.35 * state["skin"][0], 0.6 * state["skin"][0], colour[..., 0])
-        skin = np.exp(-0.5 * away / np.float32(SKIN_SPREAD**2)) * lit
         inside = face_mask(lab.shape[:2], points, 0.03 * unit) * np.float32(presence)
-        skin *= 0.5 + 0.5 * inside
-        simple[..., 0] = mix(simple[..., 0], blur(simple[..., 0], 0.02 * unit), inside * skin)
-        simple[..., 1:] = mix(simple[..., 1:], filters.wide_blur(simple[..., 1:], 0.06 * unit), 0.7 * inside * skin)
+        skin = _skin(simple, state["skin"], unit) * (0.5 + 0.5 * inside)
+        simple = _smooth_skin(simple, inside * skin, unit)
+    simple += fine * filters.spread(sharp, 3)  # thin things that stand out: spectacles, jewellery, collars
     response = filters.ink_response(mix(simple[..., 0], lab[..., 0], 0.75), tangents, 0.008 * unit)
     if presence > 0:
         response *= 1.0 + np.float32(presence) * anatomy(lab.shape[:2], points, unit)
     return np.dstack([simple, skin, response])
+
+
+def _skin(lab: Lab, colour: list[float], unit: float) -> Plane:
+    """How much each place has the colour of the clip's skin and is not in the dark, 0..1."""
+    near = blur(lab, 0.02 * unit)
+    away = near[..., 1:] - np.array(colour[1:], np.float32)
+    lit = smoothstep(0.35 * colour[0], 0.6 * colour[0] + 1.0, near[..., 0])
+    return np.exp(filters.dot(away, away) * np.float32(-0.5 / SKIN_SPREAD**2)) * lit
+
+
+def _smooth_skin(lab: Lab, amount: Plane, unit: float) -> Lab:
+    """Skin without its small tones, and with a wide, even complexion taken from skin alone."""
+    tone = mix(lab[..., 0], blur(lab[..., 0], 0.02 * unit), amount)
+    wide = filters.wide_blur(cv2.merge([lab[..., 1] * amount, lab[..., 2] * amount, amount]), 0.06 * unit)
+    share = 0.7 * amount / np.maximum(wide[..., 2], 1e-3)
+    keep = 1.0 - 0.7 * amount
+    return cv2.merge([tone, lab[..., 1] * keep + wide[..., 0] * share, lab[..., 2] * keep + wide[..., 1] * share])
 
 
 def _shaded(fields: np.ndarray, state: dict[str, Any]) -> Lab:
@@ -122,7 +135,7 @@ def _shaded(fields: np.ndarray, state: dict[str, Any]) -> Lab:
         filters.curve_lookup(tone, state["tone_curve"]), filters.curve_lookup(tone, state["skin_curve"]), skin
     )
     shade = smoothstep(2.0, 24.0, np.float32(state["skin"][0]) - banded) * skin
-    chroma = 1.22 - 0.04 * skin
+    chroma = mix(np.full_like(tone, 1.22), state["chroma"], skin)
     a = fields[..., 1] * chroma + 3.5 * shade
     b = fields[..., 2] * chroma - 1.5 * shade
     return cv2.merge([banded, a, b])
