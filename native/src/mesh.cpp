@@ -39,18 +39,17 @@ int32_t last_pixel(int64_t high, int size) {
 struct Triangle {
   int64_t x[3], y[3], dx[3], dy[3];
   int64_t owned[3];  // 1 where a centre exactly on the edge belongs to this triangle: left and top edges
-  int64_t area;
-  double inverse_depth[3];
+  double gain[3];  // 1 / (depth of the corner · twice the area): edges × gain add up to 1 / depth
 
   Triangle(const Mesh& mesh, int64_t face) {
     const int64_t* corner = mesh.faces + 3 * face;
     for (int k = 0; k < 3; ++k) {
       x[k] = mesh.xy[2 * corner[k]];
       y[k] = mesh.xy[2 * corner[k] + 1];
-      inverse_depth[k] = mesh.inverse_depth[corner[k]];
     }
-    area = (x[1] - x[0]) * (y[2] - y[0]) - (y[1] - y[0]) * (x[2] - x[0]);
+    const int64_t area = (x[1] - x[0]) * (y[2] - y[0]) - (y[1] - y[0]) * (x[2] - x[0]);
     const int64_t sign = area < 0 ? -1 : 1;
+    for (int k = 0; k < 3; ++k) gain[k] = mesh.inverse_depth[corner[k]] / double(sign * area);
     for (int k = 0; k < 3; ++k) {
       const int start = (k + 1) % 3, end = (k + 2) % 3;
       dx[k] = sign * (x[end] - x[start]);
@@ -67,11 +66,9 @@ struct Triangle {
     }
   }
 
-  // 1 / depth is linear on the screen.
+  // 1 / depth, which is linear on the screen.
   double nearness(const int64_t edges[3]) const {
-    return (double(edges[0]) * inverse_depth[0] + double(edges[1]) * inverse_depth[1] +
-            double(edges[2]) * inverse_depth[2]) /
-           double(edges[0] + edges[1] + edges[2]);
+    return double(edges[0]) * gain[0] + double(edges[1]) * gain[1] + double(edges[2]) * gain[2];
   }
 };
 
@@ -113,23 +110,37 @@ struct Tile {
 
   void describe(const Mesh& mesh, const Image& image) const {
     for (int row = row0; row <= row1; ++row) {
-      for (int column = column0; column <= column1; ++column) {
-        const int at = slot(column, row);
-        const int64_t pixel = int64_t(row) * image.width + column;
-        image.face_id[pixel] = winner[at];
-        if (winner[at] < 0) {
-          image.depth[pixel] = std::numeric_limits<float>::infinity();
-          std::fill_n(image.bary + 3 * pixel, 3, 0.0f);
-          continue;
+      int column = column0;
+      while (column <= column1) {
+        const int64_t face = winner[slot(column, row)];
+        int end = column + 1;
+        while (end <= column1 && winner[slot(end, row)] == face) ++end;
+        if (face < 0) {
+          describe_nothing(column, end, row, image);
+        } else {
+          describe_run(Triangle(mesh, face), face, column, end, row, image);
         }
-        const Triangle triangle(mesh, winner[at]);
-        int64_t edges[3];
-        triangle.edges_at(column, row, edges);
-        const double total = double(edges[0] + edges[1] + edges[2]);
-        for (int k = 0; k < 3; ++k)
-          image.bary[3 * pixel + k] = float(double(edges[k]) / total * triangle.inverse_depth[k] / nearest[at]);
-        image.depth[pixel] = float(1.0 / nearest[at]);
+        column = end;
       }
+    }
+  }
+
+  static void describe_nothing(int column, int end, int row, const Image& image) {
+    const int64_t pixel = int64_t(row) * image.width + column;
+    std::fill_n(image.face_id + pixel, end - column, int64_t(-1));
+    std::fill_n(image.depth + pixel, end - column, std::numeric_limits<float>::infinity());
+    std::fill_n(image.bary + 3 * pixel, 3 * (end - column), 0.0f);
+  }
+
+  void describe_run(const Triangle& triangle, int64_t face, int column, int end, int row, const Image& image) const {
+    for (; column < end; ++column) {
+      const int64_t pixel = int64_t(row) * image.width + column;
+      const double depth = 1.0 / nearest[slot(column, row)];
+      int64_t edges[3];
+      triangle.edges_at(column, row, edges);
+      image.face_id[pixel] = face;
+      image.depth[pixel] = float(depth);
+      for (int k = 0; k < 3; ++k) image.bary[3 * pixel + k] = float(double(edges[k]) * triangle.gain[k] * depth);
     }
   }
 };
@@ -201,5 +212,31 @@ TGB_API void tgb_mesh_rasterize(const int32_t* xy, const double* inverse_depth, 
     for (int64_t at = bins.begin[index]; at < bins.begin[index + 1]; ++at)
       tile.draw(mesh, bins.faces[at], bins.boxes[bins.faces[at]]);
     tile.describe(mesh, image);
+  });
+}
+
+// Means of interpolated vertex attributes over blocks of factor × factor samples; samples without a face count as 0.
+//
+// face_id, bary: (height factor) × (width factor) samples as filled above; attributes: `channels` per vertex;
+// means: `channels` per pixel.
+TGB_API void tgb_mesh_means(const int64_t* face_id, const float* bary, const int64_t* faces, const float* attributes,
+                            int channels, int width, int height, int factor, int threads, float* means) {
+  const float share = 1.0f / float(factor * factor);
+  tgb::parallel_for(threads, height, [&](int row) {
+    for (int column = 0; column < width; ++column) {
+      float* mean = means + (int64_t(row) * width + column) * channels;
+      std::fill_n(mean, channels, 0.0f);
+      for (int y = row * factor; y < (row + 1) * factor; ++y) {
+        for (int x = column * factor; x < (column + 1) * factor; ++x) {
+          const int64_t sample = int64_t(y) * width * factor + x;
+          if (face_id[sample] < 0) continue;
+          for (int k = 0; k < 3; ++k) {
+            const float* corner = attributes + faces[3 * face_id[sample] + k] * channels;
+            const float weight = bary[3 * sample + k] * share;
+            for (int c = 0; c < channels; ++c) mean[c] += weight * corner[c];
+          }
+        }
+      }
+    }
   });
 }
