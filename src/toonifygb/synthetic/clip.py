@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     import numpy as np
-    from jaxtyping import Float32
+    from jaxtyping import Float32, UInt8
 
     from toonifygb.structures import HeadMotion
     from toonifygb.synthetic.subject import Subject
@@ -32,17 +32,24 @@ class SyntheticClip:
     """Frames, drawn when asked for; each depends on its number alone, so any order and any worker will do."""
 
     subject: Subject
-    truth: TrackedSequence
+    sequence: TrackedSequence
     """What a perfect tracker would find: parameters, camera, and the landmarks' true places on the surface."""
     room: Float32[np.ndarray, "h w 3"]
     """The background, sRGB 0..1."""
     threads: int | None = None
 
     def __len__(self) -> int:
-        return self.truth.n_frames
+        return self.sequence.n_frames
 
     def __getitem__(self, index: int) -> SyntheticFrame:
-        return draw(self.subject, self.truth.motion[index], self.truth.camera, self.room, threads=self.threads)
+        return draw(
+            self.subject, self.sequence.motion[index], self.sequence.camera, self.room, threads=self.threads
+        )
+
+    @property
+    def frames(self) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+        """The pictures alone, in order."""
+        return (frame.image for frame in self)
 
     def __iter__(self) -> Iterator[SyntheticFrame]:
         return (self[index] for index in range(len(self)))

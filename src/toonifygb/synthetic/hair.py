@@ -49,7 +49,7 @@ HAIRLINE_HEIGHT = (
 )
 AXIS_Z = -0.005
 """Depth of the vertical axis that the hairline's angles are measured about, m."""
-GROW_STEPS = 14
+GROW_STEPS = 11
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 WRAP = np.array((0.34, 0.15, 0.09), np.float32)
 """How far past the terminator red, green and blue light reach in skin."""
 SHADOW_MAP_PX = 256
-SHADOW_BIAS_M = 0.004
+SHADOW_BIAS_M, DEPTH_BIAS_M = 0.004, 0.002
 PENUMBRA_PX = 2.2
 
 
@@ -96,43 +96,44 @@ def display(light: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
     return (x / (1 + x**2.5) ** 0.4) ** (1 / 2.2)
 
 
-def lamp_visibility(
-    points: Float32[np.ndarray, "n 3"],
-    normals: Float32[np.ndarray, "n 3"],
+@dataclass(frozen=True)
+class ShadowMap:
+    """How far a far lamp's rays get: distances to the first face, seen from the lamp."""
+
+    depth: Float32[np.ndarray, "s s"]
+    camera: Camera
+
+    def visibility(
+        self, points: Float32[np.ndarray, "n 3"], normals: Float32[np.ndarray, "n 3"], taps: int = 4
+    ) -> Float32[np.ndarray, " n"]:
+        """Share of the lamp that each point sees, 0..1, softened over a few pixels of the map.
+
+        Args:
+            points: world, m.
+            normals: unit; the points are lifted along them so that a surface does not shade itself.
+            taps: looks into the map along each axis.
+        """
+        transform, size = self.camera.world_to_camera.numpy(), self.camera.width
+        seen = (points + SHADOW_BIAS_M * normals) @ transform[:3, :3].T + transform[:3, 3]
+        pixels = seen[:, :2] / seen[:, 2:] * float(self.camera.K[0, 0]) + size / 2
+        offsets = (np.arange(taps) - (taps - 1) / 2) * (2 * PENUMBRA_PX / max(taps - 1, 1))
+        columns, rows = (np.clip(pixels[:, axis, None] + offsets, 0, size - 1).astype(np.int64) for axis in (0, 1))
+        first_hits = self.depth.reshape(-1)[rows[:, :, None] * size + columns[:, None, :]]
+        return (first_hits > (seen[:, 2] - DEPTH_BIAS_M)[:, None, None]).mean((1, 2), dtype=np.float32)
+
+
+def cast_shadows(
     vertices: Float32[np.ndarray, "v 3"],
     faces: Int64[np.ndarray, "f 3"],
     direction: tuple[float, float, float],
     *,
-    taps: int = 4,
     size: int = SHADOW_MAP_PX,
     threads: int | None = None,
-) -> Float32[np.ndarray, " n"]:
-    """Share of a far lamp that each point sees past a mesh, 0..1, softened over a few pixels of a shadow map.
-
-    Args:
-        points: world, m.
-        normals: unit; the points are lifted along them so that a surface does not shade itself.
-        vertices: of the shading mesh, world, m.
-        faces: of the shading mesh.
-        direction: towards the lamp.
-        taps: looks into the shadow map along each axis.
-        size: side of the shadow map, px.
-        threads: as in ``rasterize_mesh``.
-    """
+) -> ShadowMap:
+    """What a lamp in that direction sees of a mesh (world, m)."""
     camera = _lamp_camera(vertices, direction, size)
     hits = rasterize_mesh(torch.from_numpy(vertices), torch.from_numpy(faces), camera, threads=threads)
-    depth_map = hits.depth.numpy()
-    transform = camera.world_to_camera.numpy()
-    seen = (points + SHADOW_BIAS_M * normals) @ transform[:3, :3].T + transform[:3, 3]
-    pixels = seen[:, :2] / seen[:, 2:] * float(camera.K[0, 0]) + size / 2
-    offsets = (np.arange(taps) - (taps - 1) / 2) * (2 * PENUMBRA_PX / max(taps - 1, 1))
-    lit = np.zeros(len(points), np.float32)
-    for dx in offsets:
-        column = np.clip(pixels[:, 0] + dx, 0, size - 1).astype(np.int64)
-        for dy in offsets:
-            row = np.clip(pixels[:, 1] + dy, 0, size - 1).astype(np.int64)
-            lit += depth_map[row, column] > seen[:, 2] - 0.002
-    return lit / taps**2
+    return ShadowMap(hits.depth.numpy(), camera)
 
 
 def _lamp_camera(vertices: np.ndarray, direction: tuple[float, float, float], size: int) -> Camera:
@@ -166,6 +167,6 @@ def open_sky(
     seen, total = np.zeros(len(points), np.float32), np.full(len(points), 1e-6, np.float32)
     for x, y, z in zip(flat * np.cos(turn), height, flat * np.sin(turn), strict=True):
         weight = np.maximum(normals @ np.array((x, y, z), np.float32), 0)
-        seen += weight * lamp_visibility(points, normals, vertices, faces, (x, y, z), taps=2, size=128)
+        seen += weight * cast_shadows(vertices, faces, (x, y, z), size=128).visibility(points, normals, taps=2)
         total += weight
     return seen / total

@@ -46,6 +46,10 @@ class Materials:
     bump: Float32[np.ndarray, "n 3"]
     """Added to the normal, rest axes: what the displacement and small relief do to it."""
 
+    def optics(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The arguments of ``light.shade``: albedo, shine, gloss, softness."""
+        return self.albedo, self.shine, self.gloss, self.softness
+
 
 def paint(body: Body, look: Look, seed: int) -> Materials:
     """Materials of the bare subject."""

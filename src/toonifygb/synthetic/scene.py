@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from toonifygb.render.mesh import box_downsample, interpolate, rasterize_mesh, supersampled
+from toonifygb.render.mesh import interpolated_means, rasterize_mesh, supersampled
 from toonifygb.synthetic import light
 from toonifygb.synthetic.refine import unit
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 SUPERSAMPLE = 2
 HAIR_LIT_PER_POINT = 3
 """Every so many points of a hair ask for their own shadow."""
+HIDDEN_COSINE = -0.3
+"""Vertices turned away from the camera by more than this (cosine) are not lit, faces of such vertices not drawn."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +66,8 @@ def draw(
         threads: of the native rasteriser; the picture does not depend on it.
     """
     pose = subject.body.pose(motion)
-    key_seen = light.lamp_visibility(
-        pose.vertices, pose.normals, *_shadow_casters(subject, pose), light.KEY.direction, threads=threads
-    )
-    layers = [_skin(subject, pose, key_seen), *_hairs(subject, pose, key_seen), _rib(subject, pose)]
+    shadows = light.cast_shadows(*_shadow_casters(subject, pose), light.KEY.direction, threads=threads)
+    layers = [_skin(subject, pose, shadows), *_hairs(subject, pose, shadows), _rib(subject, pose)]
     return _compose(layers, camera, room, threads)
 
 
@@ -77,33 +77,37 @@ def _shadow_casters(subject: Subject, pose: Pose) -> tuple[Float32[np.ndarray, "
     return pose.vertices + raised * pose.normals, subject.body.faces
 
 
-def _skin(subject: Subject, pose: Pose, key_seen: Float32[np.ndarray, " v"]) -> _Layer:
+def _skin(subject: Subject, pose: Pose, shadows: light.ShadowMap) -> _Layer:
     """Head and shoulders with clothes and the body of the hair."""
     refinement, materials = subject.body.refinement, subject.materials
     positions, normals = refinement.curve(pose.vertices, pose.normals)
     positions = positions + materials.raise_m[:, None] * normals
-    bump = np.where(
-        subject.cloth[:, None] > 0.5, materials.bump @ pose.root[:3, :3].T, materials.bump @ pose.skull[:3, :3].T
-    )
-    normals = unit(normals + bump)
-    sky, key = refinement.spread(np.stack([subject.open_sky, key_seen], 1)).T
-    surface = light.Surface(normals, -unit(positions), sky, key)
-    lit = light.shade(surface, materials.albedo, materials.shine, materials.gloss, materials.softness)
-    return _Layer(positions, refinement.faces, light.display(lit), 1 - subject.cloth)
+    views = -unit(positions)
+    turned_away = np.einsum("ni,ni->n", normals, views) < HIDDEN_COSINE
+    faces = refinement.faces[~turned_away[refinement.faces].all(1)]
+    seen = np.flatnonzero(~turned_away)
+    bump = materials.bump[seen]
+    on_root = subject.cloth[seen, None] > 0.5
+    bump = np.where(on_root, bump @ pose.root[:3, :3].T, bump @ pose.skull[:3, :3].T)
+    key_seen = shadows.visibility(pose.vertices, pose.normals)
+    sky, key = refinement.spread(np.stack([subject.open_sky, key_seen], 1))[seen].T
+    surface = light.Surface(unit(normals[seen] + bump), views[seen], sky, key)
+    lit = light.shade(surface, *(values[seen] for values in materials.optics()))
+    color = np.zeros_like(positions)
+    color[seen] = light.display(lit)
+    return _Layer(positions, faces, color, 1 - subject.cloth)
 
 
-def _hairs(subject: Subject, pose: Pose, key_seen: Float32[np.ndarray, " v"]) -> list[_Layer]:
+def _hairs(subject: Subject, pose: Pose, shadows: light.ShadowMap) -> list[_Layer]:
     """Strands of the head's hair, and brows and lashes."""
     layers = []
-    casters = _shadow_casters(subject, pose)
     for strands in (subject.hair.moved(pose.skull), subject.facial_hair.place(pose)):
         n_strands, n_points = strands.width.shape
-        asked = np.unique(np.append(np.arange(0, n_points, HAIR_LIT_PER_POINT), n_points - 1))
+        asked = np.arange(0, n_points + HAIR_LIT_PER_POINT - 1, HAIR_LIT_PER_POINT).clip(max=n_points - 1)
         points, outward = (values[:, asked].reshape(-1, 3) for values in (strands.points, strands.outward))
-        seen = light.lamp_visibility(points, outward, *casters, light.KEY.direction, taps=2)
-        seen = seen.reshape(n_strands, -1)
-        each = np.stack([np.interp(np.arange(n_points), asked, row) for row in seen]).astype(np.float32)
-        color = light.display(strands.shade(each))
+        seen = shadows.visibility(points, outward, taps=2).reshape(n_strands, -1)
+        between = np.stack([np.interp(np.arange(n_points), asked, row) for row in np.eye(len(asked))])
+        color = light.display(strands.shade((seen @ between).astype(np.float32)))
         vertices, faces = strands.ribbons()
         flat = np.repeat(color.reshape(-1, 3), 2, 0)
         layers.append(_Layer(vertices, faces, flat, np.ones(len(vertices), np.float32)))
@@ -133,7 +137,7 @@ def _compose(
     is_head = np.concatenate([layer.is_head for layer in layers])[:, None]
     values = torch.from_numpy(np.concatenate([color, is_head, np.ones_like(is_head)], 1, dtype=np.float32))
     hits = rasterize_mesh(vertices, faces, supersampled(camera, SUPERSAMPLE), threads=threads)
-    means = box_downsample(interpolate(hits, faces, values), SUPERSAMPLE).numpy()
+    means = interpolated_means(hits, faces, values, SUPERSAMPLE, threads=threads).numpy()
     person = means[..., 4]
     image = means[..., :3] + (1 - person[..., None]) * room
     return SyntheticFrame(
