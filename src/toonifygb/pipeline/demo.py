@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from toonifygb.progress import Progress
 
 
-def demo(run: Run, config: RunConfig, *, seed: int, n_frames: int) -> None:
+def demo(run: Run, config: RunConfig, *, seed: int, n_frames: int, size: int = 512) -> None:
     """Makes the clip, makes its avatar, and says how near the track is to the truth.
 
     Args:
@@ -24,26 +24,27 @@ def demo(run: Run, config: RunConfig, *, seed: int, n_frames: int) -> None:
         config: settings of the pipeline.
         seed: which synthetic person.
         n_frames: length of the clip, 25 a second.
+        size: side of the square clip, px.
     """
     clip, truth_path = run.file("input.mp4"), run.work("truth.safetensors")
 
     def work(progress: Progress) -> None:
-        render_subject(seed, n_frames, clip, truth_path, progress)
+        render_subject(clip, truth_path, progress, seed=seed, n_frames=n_frames, size=size)
 
-    run.stage("clip", "making a talking head", inputs=[seed, n_frames], outputs=[clip, truth_path], work=work)
+    run.stage("clip", "making a talking head", inputs=[seed, n_frames, size], outputs=[clip, truth_path], work=work)
     create(open_source(clip, config), run, config)
     errors = synthetic.errors(track.load(run.file("track.safetensors")), track.load(truth_path), head.load("open"))
-    run.state["ground_truth"] = errors
+    run.state["ground_truth"] = errors.means()
     run.save()
 
 
-def render_subject(seed: int, n_frames: int, clip: Path, truth_path: Path, progress: Progress) -> None:
+def render_subject(
+    clip: Path, truth_path: Path, progress: Progress, *, seed: int, n_frames: int, size: int
+) -> None:
     """Writes a clip of a synthetic subject and its true track."""
-    rendered = synthetic.render_clip(synthetic.make_subject(seed), n_frames=n_frames)
-    sequence = rendered.sequence
-    size = (sequence.camera.width, sequence.camera.height)
-    with video.Writer(clip, *size, sequence.fps) as writer:
-        for done, frame in enumerate(rendered.frames, start=1):
+    filmed = synthetic.render_clip(synthetic.make_subject(seed), n_frames=n_frames, size=size)
+    with video.Writer(clip, size, size, filmed.sequence.fps) as writer:
+        for done, frame in enumerate(filmed.frames, start=1):
             writer.write(frame)
             progress.update(done, n_frames)
-    track.save(sequence, truth_path)
+    track.save(filmed.sequence, truth_path)

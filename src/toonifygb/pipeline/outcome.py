@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import platform
@@ -93,15 +94,13 @@ def preview_panels(
     dataset = train.load_dataset(run.work("dataset"))
     viewer = AvatarViewer(avatars.load(run.file("avatar")), _PANEL, backend=config.backend, threads=config.threads)
     period = _SWING_SECONDS * source.info.fps
-    for index, photo in enumerate(source.frames(config)):
-        if index == dataset.n_frames:
-            return
+    films = zip(source.frames(config), video.read(run.file("stylized.mp4")), strict=False)
+    for index, film in enumerate(itertools.islice(films, dataset.n_frames)):
         motion = sequence.motion[index]
         viewer.look_through(dataset.camera(index))
         swing = _SWING_DEG * math.sin(2 * math.pi * index / period)
         yield [
-            pictures.fit(train.crop(photo, dataset.boxes[index], dataset.size), _PANEL),
-            pictures.fit(dataset.frames[index], _PANEL),
+            *(train.crop(frame, dataset.boxes[index], _PANEL) for frame in film),
             viewer.frame(motion),
             viewer.frame(motion, yaw_deg=swing),
         ]
@@ -138,7 +137,7 @@ def metrics_record(source: Source, run: Run, config: RunConfig, scores: dict[str
         "clip_sha256": source.sha256,
         "style": config.stylize.style,
         "quality": config.quality,
-        **scores,
+        **{name: value for name, value in scores.items() if not isinstance(value, list)},
         "n_frames": sequence.n_frames,
         "n_train": len(dataset.split.train),
         "n_test": len(dataset.split.test),
