@@ -69,6 +69,9 @@ def test_read_stops_after_max_frames(tmp_path: Path):
     ],
 )
 def test_display_matrix_is_applied(tmp_path: Path, matrix: tuple[int, ...], expected: tuple[str, ...]):
+    if not hasattr(av.VideoStream, "set_display_matrix"):
+        pytest.skip("this PyAV cannot write a display matrix")
+
     def setup(stream: av.VideoStream) -> None:
         stream.set_display_matrix([*matrix, 0, 0, 1 << 30])
 
@@ -154,9 +157,12 @@ def test_ten_bits_become_eight(tmp_path: Path):
 def test_hdr_keeps_diffuse_white_bright_and_highlights_below_it_apart(tmp_path: Path, transfer: int, white: float):
     """BT.2408 puts diffuse white at 58 % of PQ and 75 % of HLG; brighter light must stay distinguishable."""
     levels = np.array([0.0, white / 2, white, min(1.0, white * 1.2)])
-    luma = np.rint(64 + 876 * levels).astype(np.uint16).repeat(16)[None].repeat(32, 0)
-    chroma = np.full((16, 32), 512, np.uint16)
-    picture = np.concatenate((luma.ravel(), chroma.ravel(), chroma.ravel())).reshape(48, 64)
+    luma = np.rint(64 + 876 * levels).astype("<u2").repeat(16)[None].repeat(32, 0)
+    picture = av.VideoFrame(64, 32, "yuv420p10le")
+    for plane, values in zip(picture.planes, (luma, np.full((16, 32), 512), np.full((16, 32), 512)), strict=True):
+        rows = np.zeros((plane.height, plane.line_size // 2), "<u2")
+        rows[:, : plane.width] = values
+        plane.update(rows.tobytes())
 
     def setup(stream: av.VideoStream) -> None:
         context = stream.codec_context
@@ -167,7 +173,7 @@ def test_hdr_keeps_diffuse_white_bright_and_highlights_below_it_apart(tmp_path: 
         stream = output.add_stream("libx264", rate=25, options={"qp": "0"})
         stream.height, stream.width, stream.pix_fmt = 32, 64, "yuv420p10le"
         setup(stream)
-        output.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="yuv420p10le")))
+        output.mux(stream.encode(picture))
         output.mux(stream.encode(None))
     clip = open_clip(path)
     (frame,) = clip

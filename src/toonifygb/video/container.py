@@ -13,6 +13,7 @@ from av.stream import Disposition
 
 from toonifygb.errors import InputError
 from toonifygb.structures import VideoInfo
+from toonifygb.video import hdr
 from toonifygb.video.pixels import PictureFormat
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ class VideoFile:
                 raise InputError(f"{path} contains no picture that can be decoded", "convert or re-export the clip")
             aspect = float(stream.sample_aspect_ratio or 1)
             stretched = abs(aspect - 1) > _MAX_PIXEL_STRETCH
-            self._format = PictureFormat.of(first, aspect if stretched else 1.0)
+            self._format = PictureFormat.of(first, aspect if stretched else 1.0, hdr.transfer_of(stream))
             interlaced = first.interlaced_frame
         width, height = self._format.upright_size
         findings = list(timing.findings)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 if TYPE_CHECKING:
-    from av import VideoFrame
+    from av.video.stream import VideoStream
     from jaxtyping import Float, UInt8, UInt16
 
 Transfer = Literal["pq", "hlg"]
@@ -31,9 +31,9 @@ _KNEE = 0.7
 """Light below this share of diffuse white passes unchanged; above, it approaches 1."""
 
 
-def transfer_of(frame: VideoFrame) -> Transfer | None:
-    """The HDR transfer of a picture; ``None`` for standard range."""
-    return _TRANSFERS.get(int(frame.color_trc))
+def transfer_of(stream: VideoStream) -> Transfer | None:
+    """The HDR transfer of a stream; ``None`` for standard range."""
+    return _TRANSFERS.get(int(stream.codec_context.color_trc))
 
 
 def tone_map(image: UInt16[np.ndarray, "h w 3"], transfer: Transfer) -> UInt8[np.ndarray, "h w 3"]:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from av.video.reformatter import ColorRange, Colorspace, Interpolation
 
 from toonifygb.video import hdr
 
@@ -20,18 +19,15 @@ if TYPE_CHECKING:
     from av import VideoFrame
     from jaxtyping import UInt8
 
-_MATRICES = {
-    1: Colorspace.ITU709,
-    4: Colorspace.FCC,
-    5: Colorspace.ITU601,
-    6: Colorspace.ITU601,
-    7: Colorspace.SMPTE240M,
-    9: Colorspace.BT2020,
-    10: Colorspace.BT2020,
-}
-"""Colour matrix by the number H.273 gives it in the stream."""
-_FULL_RANGE = 2
-_QUALITY = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
+# swscale's own numbers rather than PyAV's enumerations, whose members differ from version to version.
+_BT709, _BT601, _HIGH_DEFINITION_FROM = 1, 5, (1280, 577)
+_MATRICES = {1: 1, 4: 4, 5: 5, 6: 5, 7: 7, 9: 9, 10: 9}
+"""SWS_CS_* of the colour matrix by the number H.273 gives it in the stream."""
+LIMITED_RANGE, FULL_RANGE = 1, 2
+"""AVCOL_RANGE_*: luma 16..235 or 0..255."""
+BICUBIC, FULL_CHROMA_OUT, FULL_CHROMA_IN, ACCURATE_ROUNDING = 0x4, 0x2000, 0x4000, 0x40000
+"""SWS_* flags."""
+_READING = BICUBIC | FULL_CHROMA_OUT | ACCURATE_ROUNDING
 """Without the last two swscale rounds every colour down by up to 3 levels and doubles chroma columns."""
 
 
@@ -75,13 +71,15 @@ class PictureFormat:
     """Stored size with square pixels, before the turn, px."""
     height: int
     turn: Turn
+    transfer: hdr.Transfer | None
+    """How an HDR clip codes light; ``None`` for standard range."""
 
     @classmethod
-    def of(cls, frame: VideoFrame, pixel_aspect: float) -> PictureFormat:
+    def of(cls, frame: VideoFrame, pixel_aspect: float, transfer: hdr.Transfer | None) -> PictureFormat:
         """Format of a clip from its first picture; the shorter axis of a non-square pixel is stretched."""
         width = round(frame.width * max(pixel_aspect, 1.0))
         height = round(frame.height / min(pixel_aspect, 1.0))
-        return cls(width, height, turn_of(frame))
+        return cls(width, height, turn_of(frame), transfer)
 
     @property
     def upright_size(self) -> tuple[int, int]:
@@ -95,11 +93,10 @@ class PictureFormat:
             frame: decoded picture of any pixel format and size.
             note: receives a sentence for whatever could not be kept; the same one each time.
         """
-        transfer = hdr.transfer_of(frame)
         has_alpha = any(component.is_alpha for component in frame.format.components)
-        if transfer is not None:
+        if self.transfer is not None:
             note("is filmed for HDR screens; tone-mapped to standard range")
-            image = hdr.tone_map(self._convert(frame, "rgb48le"), transfer)
+            image = hdr.tone_map(self._convert(frame, "rgb48le"), self.transfer)
         elif has_alpha:
             image, was_opaque = flatten_alpha(self._convert(frame, "rgba"))
             if not was_opaque:
@@ -115,8 +112,8 @@ class PictureFormat:
             format=pixel_format,
             src_colorspace=_matrix_of(frame),
             src_color_range=_range_of(frame),
-            dst_color_range=ColorRange.JPEG,
-            interpolation=_QUALITY,
+            dst_color_range=FULL_RANGE,
+            interpolation=_READING,
         )
         image = converted.to_ndarray()
         # A picture that needed no conversion still belongs to the decoder, which may predict the next one from it.
@@ -132,12 +129,13 @@ def flatten_alpha(image: UInt8[np.ndarray, "h w 4"]) -> tuple[UInt8[np.ndarray, 
     return ((image[..., :3].astype(np.uint16) * alpha + 127) // 255).astype(np.uint8), False
 
 
-def _matrix_of(frame: VideoFrame) -> Colorspace:
+def _matrix_of(frame: VideoFrame) -> int:
     """The picture's matrix; where none is named, what players assume: BT.709 above standard definition."""
-    high_definition = frame.width >= 1280 or frame.height > 576
-    return _MATRICES.get(int(frame.colorspace), Colorspace.ITU709 if high_definition else Colorspace.ITU601)
+    width, height = _HIGH_DEFINITION_FROM
+    guess = _BT709 if frame.width >= width or frame.height >= height else _BT601
+    return _MATRICES.get(int(frame.colorspace), guess)
 
 
-def _range_of(frame: VideoFrame) -> ColorRange:
-    full = int(frame.color_range) == _FULL_RANGE or frame.format.name.startswith("yuvj") or frame.format.is_rgb
-    return ColorRange.JPEG if full else ColorRange.MPEG
+def _range_of(frame: VideoFrame) -> int:
+    full = int(frame.color_range) == FULL_RANGE or frame.format.name.startswith("yuvj") or frame.format.is_rgb
+    return FULL_RANGE if full else LIMITED_RANGE

@@ -12,9 +12,9 @@ import av
 import numpy as np
 from av import VideoFrame
 from av.error import FFmpegError
-from av.video.reformatter import ColorRange, Colorspace, Interpolation
 
 from toonifygb.errors import InputError
+from toonifygb.video import pixels
 from toonifygb.video.sound import open_sound
 
 if TYPE_CHECKING:
@@ -28,9 +28,9 @@ _QUALITY = "17"
 """x264's constant rate factor: visually lossless, since a written clip may be read again for training."""
 _LOOKAHEAD_BYTES = 256 * 2**20
 """Most memory x264 may hold in frames to look ahead; only clips beyond 1440p feel it."""
-_BT709, _LIMITED = 1, 1
-"""H.273's number for BT.709 (primaries, transfer and matrix), and FFmpeg's for studio range."""
-_ROUNDING = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INP
+_BT709 = 1
+"""H.273's number for BT.709, alike for primaries, transfer and matrix, and swscale's for the matrix."""
+_WRITING = pixels.BICUBIC | pixels.FULL_CHROMA_IN | pixels.ACCURATE_ROUNDING
 
 
 class Writer:
@@ -94,10 +94,10 @@ class Writer:
         )
         picture = VideoFrame.from_ndarray(_padded_to_even(frame), format="rgb24").reformat(
             format="yuv420p",
-            dst_colorspace=Colorspace.ITU709,
-            src_color_range=ColorRange.JPEG,
-            dst_color_range=ColorRange.MPEG,
-            interpolation=_ROUNDING,
+            dst_colorspace=_BT709,
+            src_color_range=pixels.FULL_RANGE,
+            dst_color_range=pixels.LIMITED_RANGE,
+            interpolation=_WRITING,
         )
         picture.pts, picture.time_base = self.n_frames, 1 / self._rate
         with self._explained():
@@ -147,7 +147,7 @@ class Writer:
         context = stream.codec_context
         context.time_base = 1 / self._rate
         context.color_primaries = context.color_trc = context.colorspace = _BT709
-        context.color_range = _LIMITED
+        context.color_range = pixels.LIMITED_RANGE
         return stream
 
     def _discard(self) -> None:
