@@ -1,7 +1,7 @@
 // C interface of the rasteriser.
 #include "raster.h"
 
-#include <chrono>
+#include <ctime>
 #include <mutex>
 #include <new>
 #include <vector>
@@ -22,25 +22,26 @@ tgb::Frame* take_frame() {
   return frame;
 }
 
+// Processor time of the whole process: on a shared machine the only time that repeats.
 class Stopwatch {
  public:
-  explicit Stopwatch(double* seconds) : seconds_(seconds), start_(Clock::now()) {}
+  explicit Stopwatch(double* seconds) : seconds_(seconds), start_(std::clock()) {}
   void lap() {
-    const auto now = Clock::now();
-    if (seconds_ != nullptr) *seconds_++ = std::chrono::duration<double>(now - start_).count();
+    if (seconds_ == nullptr) return;
+    const std::clock_t now = std::clock();
+    *seconds_++ = static_cast<double>(now - start_) / CLOCKS_PER_SEC;
     start_ = now;
   }
 
  private:
-  using Clock = std::chrono::steady_clock;
   double* seconds_;
-  Clock::time_point start_;
+  std::clock_t start_;
 };
 
 }  // namespace
 
-// Renders `scene` to color [h, w, 3] and alpha [h, w]. `radii` [n] (px, 0 where not visible) and `seconds` [4] (time of
-// project, sort, bin, composite) may be null. Returns what tgb_raster_backward needs, or null when out of memory;
+// Renders `scene` to color [h, w, 3] and alpha [h, w]. `radii` [n] (px, 0 where not visible) and `seconds` [4] (processor
+// time of project, sort, bin, composite) may be null. Returns what tgb_raster_backward needs, or null when out of memory;
 // hand it back with tgb_raster_release.
 TGB_API tgb::Frame* tgb_raster_forward(const tgb::Scene* scene, float* color, float* alpha, int32_t* radii,
                                        double* seconds) {

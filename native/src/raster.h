@@ -53,7 +53,8 @@ struct alignas(64) Splat {
   float r, g, b;
   int32_t id;                     // index in the input
   uint16_t x0, y0, x1, y1;        // blocks of the image it may touch: [x0, x1) x [y0, y1)
-  float depth, unused;
+  float depth;
+  float place;                    // in the list of the tile at work
 };
 static_assert(sizeof(Splat) == 64, "one cache line");
 

@@ -27,6 +27,7 @@ struct TileView {
     left = tile % frame.tiles_x * kTile, top = tile / frame.tiles_x * kTile;
     width = imin(kTile, scene.camera.width - left), height = imin(kTile, scene.camera.height - top);
   }
+  bool whole() const { return width == kTile && height == kTile; }
   bool holds(int block, int lane) const {
     return kBlockTable.x[block][lane] < width && kBlockTable.y[block][lane] < height;
   }
@@ -42,13 +43,22 @@ static inline uint64_t rectangle_mask(const Splat& s, int left, int top) {
   return row * 0x0101010101010101ull & rows_below & ~((1ull << (8 * y0)) - 1);
 }
 
+// Four neighbouring pixels of one row of a block, as they stand in an image row.
+static inline void copy_quad(float* to, const float* from) { memcpy(to, from, kBlock * sizeof(float)); }
+
+constexpr uint64_t kGroup = (1ull << kWidth) - 1;
+
 // Blocks whose rectangle of pixel centres the ellipse {log2 alpha >= threshold} reaches, exactly up to rounding. The
 // exponent is concave, so its largest value over a rectangle is at the point nearest the mean along x (then the best
 // y there) or along y (then the best x). `s` has its mean relative to the tile.
-static inline uint64_t ellipse_mask(const Splat& s, float threshold) {
+//
+// Blocks outside `within` are not looked for. Narrow vectors skip groups without any; for 16 lanes a mispredicted
+// branch costs more than the test.
+static inline uint64_t ellipse_mask(const Splat& s, float threshold, uint64_t within) {
   const F ux(s.ux), uy(s.uy), vy(s.vy), lo(s.lo), zero(0.f), extent(kBlock - 1.f), limit(threshold - 1e-3f);
   uint64_t mask = 0;
   for (int b = 0; b < kBlocks; b += kWidth) {
+    if (kWidth < 16 && (within >> b & kGroup) == 0) continue;
     const F x0 = load(kBlockTable.left + b) - F(s.mx), y0 = load(kBlockTable.top + b) - F(s.my);
     const F x1 = x0 + extent, y1 = y0 + extent;
     const F near_x = clamp(zero, x0, x1), near_y = clamp(zero, y0, y1);
@@ -57,7 +67,7 @@ static inline uint64_t ellipse_mask(const Splat& s, float threshold) {
     const F p1 = fnma(v1, v1, fnma(u1, u1, lo)), p2 = fnma(v2, v2, fnma(u2, u2, lo));
     mask |= static_cast<uint64_t>(bits(ge(vmax(p1, p2), limit))) << b;
   }
-  return mask;
+  return mask & within;
 }
 
 }  // namespace TGB_ISA

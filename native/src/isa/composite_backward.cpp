@@ -22,20 +22,29 @@ struct Pixels {
 
 void load_tile(Pixels& pixels, const Frame& frame, const Scene& scene, const Gradients& gradients, int tile) {
   const TileView view(frame, scene, tile);
-  const float *final_T = frame.transmittance.data() + static_cast<size_t>(tile) * kBlocks * kLanes,
-              *background = scene.background;
-  if (view.width < kTile || view.height < kTile) memset(&pixels, 0, sizeof pixels);
+  if (!view.whole()) memset(&pixels, 0, sizeof pixels);
+  float r[kTile] = {}, g[kTile] = {}, b[kTile] = {}, a[kTile] = {};
   for (int y = 0; y < view.height; y++) {
     const size_t row = static_cast<size_t>(view.top + y) * scene.camera.width + view.left;
-    for (int x = 0; x < view.width; x++) {
-      const int b = y / kBlock * kBlocksAcross + x / kBlock, l = y % kBlock * kBlock + x % kBlock;
-      const float T = final_T[b * kLanes + l], *v = gradients.v_color + 3 * (row + x);
-      const float from_alpha = T * gradients.v_alpha[row + x];
-      pixels.T[b][l] = T, pixels.alpha[b][l] = from_alpha;
-      pixels.r[b][l] = v[0], pixels.g[b][l] = v[1], pixels.b[b][l] = v[2];
-      pixels.Q[b][l] = T * (background[0] * v[0] + background[1] * v[1] + background[2] * v[2]) - from_alpha;
+    const float* v = gradients.v_color + 3 * row;
+    for (int x = 0; x < view.width; x++) r[x] = v[3 * x], g[x] = v[3 * x + 1], b[x] = v[3 * x + 2];
+    memcpy(a, gradients.v_alpha + row, view.width * sizeof(float));
+    for (int x = 0; x < kTile; x += kBlock) {
+      const int block = y / kBlock * kBlocksAcross + x / kBlock, lane = y % kBlock * kBlock;
+      copy_quad(pixels.r[block] + lane, r + x), copy_quad(pixels.g[block] + lane, g + x);
+      copy_quad(pixels.b[block] + lane, b + x), copy_quad(pixels.alpha[block] + lane, a + x);
     }
   }
+  const F red(scene.background[0]), green(scene.background[1]), blue(scene.background[2]);
+  const float* final_T = frame.transmittance.data() + static_cast<size_t>(tile) * kBlocks * kLanes;
+  for (int block = 0; block < kBlocks; block++)
+    for (int k = 0; k < kLanes; k += kWidth) {
+      const F T = load(final_T + block * kLanes + k), from_alpha = T * load(pixels.alpha[block] + k);
+      const F behind = fma(red, load(pixels.r[block] + k),
+                           fma(green, load(pixels.g[block] + k), blue * load(pixels.b[block] + k)));
+      store(pixels.T[block] + k, T), store(pixels.alpha[block] + k, from_alpha);
+      store(pixels.Q[block] + k, fma(T, behind, -from_alpha));
+    }
 }
 
 struct Sums {
@@ -83,7 +92,7 @@ void composite_tile_backward(Frame& frame, const Scene& scene, const Gradients& 
     }
     float* out = slot(e);
     if (frame.masks[e] == 0) {
-      memset(out, 0, 12 * sizeof(float));
+      memset(out, 0, kSlot * sizeof(float));
       continue;
     }
     const Splat& s = frame.sorted[static_cast<uint32_t>(frame.list[e])];
@@ -96,8 +105,9 @@ void composite_tile_backward(Frame& frame, const Scene& scene, const Gradients& 
     sum4(out, sums.x, sums.u, sums.v, sums.uu);
     sum4(out + 4, sums.uv, sums.vv, sums.r, sums.g);
     sum4(out + 8, sums.b, sums.alpha_u, sums.alpha_v, F(0.f));
+    memset(out + 12, 0, 4 * sizeof(float));
   }
-  for (uint32_t e = used; e < end; e++) memset(slot(e), 0, 12 * sizeof(float));  // hidden behind opaque pixels
+  for (uint32_t e = used; e < end; e++) memset(slot(e), 0, kSlot * sizeof(float));  // hidden behind opaque pixels
 }
 
 }  // namespace

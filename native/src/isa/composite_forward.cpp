@@ -20,18 +20,22 @@ struct Limits {
 };
 
 inline uint64_t clear(Pixels& pixels, const TileView& view, float* last) {
-  uint64_t alive = 0;
   memset(&pixels, 0, sizeof pixels);
+  for (int i = 0; i < kBlocks * kLanes; i++) last[i] = -1, (&pixels.T[0][0])[i] = 1;
+  if (view.whole()) return ~0ull;
+  uint64_t alive = 0;
   for (int b = 0; b < kBlocks; b++)
     for (int l = 0; l < kLanes; l++) {
-      last[b * kLanes + l] = -1;
-      if (view.holds(b, l)) pixels.T[b][l] = 1, alive |= 1ull << b;
+      if (view.holds(b, l))
+        alive |= 1ull << b;
+      else
+        pixels.T[b][l] = 0;
     }
   return alive;
 }
 
 // Composites the splats in `hits` over one block; returns whether any of its pixels goes on.
-inline bool composite_block(Pixels& pixels, float* last, int block, uint64_t hits, const Splat* splats, uint32_t first,
+inline bool composite_block(Pixels& pixels, float* last, int block, uint64_t hits, const Splat* splats,
                             const Limits& limits) {
   bool alive = false;
   for (int k = 0; k < kLanes; k += kWidth) {
@@ -39,17 +43,16 @@ inline bool composite_block(Pixels& pixels, float* last, int block, uint64_t hit
     F T = load(pixels.T[block] + k), stopped = load(pixels.stopped[block] + k), latest = load(last + k);
     F r = load(pixels.r[block] + k), g = load(pixels.g[block] + k), b = load(pixels.b[block] + k);
     for (uint64_t rest = hits; rest != 0; rest &= rest - 1) {
-      const int j = __builtin_ctzll(rest);
-      const Splat& s = splats[j];
+      const Splat& s = splats[__builtin_ctzll(rest)];
       const F dx = x - F(s.mx), dy = y - F(s.my), u = fma(F(s.ux), dx, F(s.uy) * dy), v = F(s.vy) * dy;
       const F exponent = fnma(v, v, fnma(u, u, F(s.lo)));
       const M reached = ge(exponent, limits.threshold);
       const F alpha = keep(reached, vmin(exp2(exponent), limits.alpha_max));
       const F next = fnma(alpha, T, T);
       const M go = ge(next, limits.transmittance_min);
-      latest = select(both(reached, go), F(static_cast<float>(first + j)), latest);
+      latest = select(both(reached, go), F(s.place), latest);
       const F weight = keep(go, alpha * T);
-      stopped += T - keep(go, T);
+      stopped = select(go, stopped, vmax(stopped, T));  // T is 0 once stopped
       T = keep(go, next);
       r = fma(weight, F(s.r), r), g = fma(weight, F(s.g), g), b = fma(weight, F(s.b), b);
     }
@@ -60,21 +63,29 @@ inline bool composite_block(Pixels& pixels, float* last, int block, uint64_t hit
   return alive;
 }
 
-void write_tile(const Pixels& pixels, const Scene& scene, const TileView& view, float* transmittance, float* color,
+// Puts the background behind the pixels and writes them to the image rows.
+void write_tile(Pixels& pixels, const Scene& scene, const TileView& view, float* transmittance, float* color,
                 float* alpha) {
-  const float* background = scene.background;
-  for (int y = 0; y < view.height; y++) {
-    const size_t row = static_cast<size_t>(view.top + y) * scene.camera.width + view.left;
-    for (int x = 0; x < view.width; x++) {
-      const int b = y / kBlock * kBlocksAcross + x / kBlock, l = y % kBlock * kBlock + x % kBlock;
-      const float T = pixels.T[b][l] + pixels.stopped[b][l];
-      transmittance[b * kLanes + l] = T;
-      float* rgb = color + 3 * (row + x);
-      rgb[0] = pixels.r[b][l] + T * background[0];
-      rgb[1] = pixels.g[b][l] + T * background[1];
-      rgb[2] = pixels.b[b][l] + T * background[2];
-      alpha[row + x] = 1 - T;
+  const F red(scene.background[0]), green(scene.background[1]), blue(scene.background[2]);
+  for (int b = 0; b < kBlocks; b++)
+    for (int k = 0; k < kLanes; k += kWidth) {
+      const F T = load(pixels.T[b] + k) + load(pixels.stopped[b] + k);
+      store(transmittance + b * kLanes + k, T), store(pixels.T[b] + k, F(1.f) - T);
+      store(pixels.r[b] + k, fma(T, red, load(pixels.r[b] + k)));
+      store(pixels.g[b] + k, fma(T, green, load(pixels.g[b] + k)));
+      store(pixels.b[b] + k, fma(T, blue, load(pixels.b[b] + k)));
     }
+  float r[kTile], g[kTile], b[kTile], a[kTile];
+  for (int y = 0; y < view.height; y++) {
+    for (int x = 0; x < kTile; x += kBlock) {
+      const int block = y / kBlock * kBlocksAcross + x / kBlock, lane = y % kBlock * kBlock;
+      copy_quad(r + x, pixels.r[block] + lane), copy_quad(g + x, pixels.g[block] + lane);
+      copy_quad(b + x, pixels.b[block] + lane), copy_quad(a + x, pixels.T[block] + lane);
+    }
+    const size_t row = static_cast<size_t>(view.top + y) * scene.camera.width + view.left;
+    float* rgb = color + 3 * row;
+    for (int x = 0; x < view.width; x++) rgb[3 * x] = r[x], rgb[3 * x + 1] = g[x], rgb[3 * x + 2] = b[x];
+    memcpy(alpha + row, a, view.width * sizeof(float));
   }
 }
 
@@ -96,14 +107,15 @@ void composite_tile(Frame& frame, const Scene& scene, int tile, float* color, fl
       Splat& s = splats[j] = frame.sorted[static_cast<uint32_t>(frame.list[at + j])];
       const uint64_t inside = rectangle_mask(s, view.left, view.top);
       s.mx -= static_cast<float>(view.left), s.my -= static_cast<float>(view.top);
-      frame.masks[at + j] = rows[j] = ellipse_mask(s, threshold) & inside & alive;
+      s.place = static_cast<float>(at + j - begin);
+      frame.masks[at + j] = rows[j] = ellipse_mask(s, threshold, inside & alive);
     }
     for (int j = count; j < kBatch; j++) rows[j] = 0;
     transpose_bits(rows, hits);
     uint64_t still = 0;
     for (uint64_t rest = alive; rest != 0; rest &= rest - 1) {
       const int b = __builtin_ctzll(rest);
-      if (composite_block(pixels, last + b * kLanes, b, hits[b], splats, at - begin, limits)) still |= 1ull << b;
+      if (composite_block(pixels, last + b * kLanes, b, hits[b], splats, limits)) still |= 1ull << b;
     }
     alive = still;
     at += static_cast<uint32_t>(count);

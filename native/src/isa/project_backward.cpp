@@ -18,9 +18,13 @@ inline bool gather(const Frame& frame, int i, int count, float sums[][kWidth]) {
   for (int lane = 0; lane < count; lane++) {
     if (!frame.drawn[i + lane]) continue;
     any_drawn = true;
-    float total[12] = {0};
-    for (uint32_t k = frame.slot_begin[i + lane]; k < frame.slot_begin[i + lane + 1]; k++)
-      for (int c = 0; c < 12; c++) total[c] += frame.slots[static_cast<size_t>(k) * kSlot + c];
+    alignas(64) float total[kSlot];
+    F sum[kSlot / kWidth];
+    for (F& part : sum) part = F(0.f);
+    const float* slot = frame.slots.data() + static_cast<size_t>(frame.slot_begin[i + lane]) * kSlot;
+    for (uint32_t k = frame.slot_begin[i + lane]; k < frame.slot_begin[i + lane + 1]; k++, slot += kSlot)
+      for (int c = 0; c < kSlot; c += kWidth) sum[c / kWidth] += load(slot + c);
+    for (int c = 0; c < kSlot; c += kWidth) store(total + c, sum[c / kWidth]);
     for (int c = 0; c < kSums; c++) sums[c][lane] = total[c];
   }
   return any_drawn;

@@ -10,31 +10,24 @@ namespace {
 constexpr float kHalfLog2e = 0.72134752044448170f, kTwoLn2 = 1.3862943611198906f;
 constexpr float kGuard = 0.01f;  // px added around a bounding box against rounding
 
-// One lane of a projected group, laid out for the scalar part.
+// A projected group, laid out for the scalar part.
 struct Lanes {
   alignas(64) float px[kWidth], py[kWidth], ux[kWidth], uy[kWidth], vy[kWidth], lo[kWidth];
-  alignas(64) float slope_x[kWidth], slope_y[kWidth], depth[kWidth], radius[kWidth], reach_x[kWidth], reach_y[kWidth];
+  alignas(64) float slope_x[kWidth], slope_y[kWidth], depth[kWidth], radius[kWidth];
+  alignas(64) float tile_begin[2][kWidth], tile_end[2][kWidth];    // 3DGB's tiles, x and y, before truncation
+  alignas(64) float block_begin[2][kWidth], block_end[2][kWidth];  // blocks within reach, before truncation
   alignas(64) float basis[16][kWidth];
 };
 
-// Tiles [first, last) of side `tile` that 3DGB's square of `radius` about p touches, on an axis of `size` px.
-inline void tile_range(float p, float radius, int tile, int size, int& first, int& last) {
-  const float n = static_cast<float>((size + tile - 1) / tile), lo = (p - radius) / tile,
-              hi = (p + radius + (tile - 1)) / tile;
-  first = static_cast<int>(lo < 0 ? 0 : lo > n ? n : lo);
-  last = static_cast<int>(hi < 0 ? 0 : hi > n ? n : hi);
-}
-
-// Blocks [first, last) with a pixel centre within `reach` of p, cut to [first, last) as given.
-inline void cut_to_reach(float p, float reach, int size, uint16_t& first, uint16_t& last) {
-  const float lo = p - reach + (1 - kGuard), hi = p + reach + kGuard;
-  if (!(hi >= 0) || !(lo < size)) {
-    last = first;
-    return;
-  }
-  const int begin = lo < 0 ? 0 : static_cast<int>(lo) / kBlock;
-  const int end = (hi > size - 1 ? size - 1 : static_cast<int>(hi)) / kBlock + 1;
-  first = static_cast<uint16_t>(imax(first, begin)), last = static_cast<uint16_t>(imin(last, end));
+// Along one axis of `size` px: the tiles that 3DGB's square of `radius` about p touches, and the blocks with a pixel
+// centre within `reach` of p.
+inline void ranges(Lanes& lanes, int axis, F p, F radius, F reach, int tile, int size) {
+  const F n(static_cast<float>((size + tile - 1) / tile)), side(static_cast<float>(tile)), zero(0.f);
+  store(lanes.tile_begin[axis], clamp((p - radius) / side, zero, n));
+  store(lanes.tile_end[axis], clamp((p + radius + F(tile - 1.f)) / side, zero, n));
+  const F first = p - reach + F(1 - kGuard), last = p + reach + F(kGuard), block(static_cast<float>(kBlock));
+  store(lanes.block_begin[axis], clamp(first, zero, F(static_cast<float>(size))) / block);
+  store(lanes.block_end[axis], (clamp(last, -block, F(size - 1.f)) + block) / block);  // below 0: truncates to none
 }
 
 template <int N>
@@ -66,28 +59,27 @@ inline uint8_t colour(const Splats& splats, const Lanes& lanes, int i, int lane,
 
 // Fills the record of Gaussian i and returns whether it can reach a pixel; sets its 3DGB radius (0: not visible).
 inline bool make_record(Frame& frame, const Scene& scene, const Lanes& lanes, int i, int lane, int32_t& radius) {
-  const int tile = scene.constants.tile, width = scene.camera.width, height = scene.camera.height;
-  const float px = lanes.px[lane], py = lanes.py[lane], r = lanes.radius[lane];
-  int x0, x1, y0, y1;
-  tile_range(px, r, tile, width, x0, x1);
-  tile_range(py, r, tile, height, y0, y1);
-  if (x1 <= x0 || y1 <= y0) return false;
-  radius = r < 1e9f ? static_cast<int32_t>(r) : 1000000000;
-
-  const float lo = lanes.lo[lane];
-  Splat s;
-  const int blocks = tile / kBlock;
-  s.x0 = static_cast<uint16_t>(x0 * blocks), s.x1 = static_cast<uint16_t>(x1 * blocks);
-  s.y0 = static_cast<uint16_t>(y0 * blocks), s.y1 = static_cast<uint16_t>(y1 * blocks);
-  cut_to_reach(px, lanes.reach_x[lane], width, s.x0, s.x1);
-  cut_to_reach(py, lanes.reach_y[lane], height, s.y0, s.y1);
-  if (s.x1 <= s.x0 || s.y1 <= s.y0) return false;
-  s.mx = px, s.my = py, s.ux = lanes.ux[lane], s.uy = lanes.uy[lane], s.vy = lanes.vy[lane], s.lo = lo;
-  s.slope_x = lanes.slope_x[lane], s.slope_y = lanes.slope_y[lane];
-  s.id = i, s.depth = lanes.depth[lane], s.unused = 0;
+  const int blocks = scene.constants.tile / kBlock;
+  int begin[2], end[2];
+  for (int axis = 0; axis < 2; axis++) {
+    begin[axis] = static_cast<int>(lanes.tile_begin[axis][lane]), end[axis] = static_cast<int>(lanes.tile_end[axis][lane]);
+    if (begin[axis] >= end[axis]) return false;
+  }
+  radius = lanes.radius[lane] < 1e9f ? static_cast<int32_t>(lanes.radius[lane]) : 1000000000;
+  for (int axis = 0; axis < 2; axis++) {
+    begin[axis] = imax(begin[axis] * blocks, static_cast<int>(lanes.block_begin[axis][lane]));
+    end[axis] = imin(end[axis] * blocks, static_cast<int>(lanes.block_end[axis][lane]));
+    if (begin[axis] >= end[axis]) return false;
+  }
+  Splat& s = frame.records[i];
   frame.clamped[i] = colour(scene.splats, lanes, i, lane, &s.r);
   if (!__builtin_isfinite(s.r + s.g + s.b)) return false;
-  frame.records[i] = s;
+  s.x0 = static_cast<uint16_t>(begin[0]), s.x1 = static_cast<uint16_t>(end[0]);
+  s.y0 = static_cast<uint16_t>(begin[1]), s.y1 = static_cast<uint16_t>(end[1]);
+  s.mx = lanes.px[lane], s.my = lanes.py[lane], s.lo = lanes.lo[lane];
+  s.ux = lanes.ux[lane], s.uy = lanes.uy[lane], s.vy = lanes.vy[lane];
+  s.slope_x = lanes.slope_x[lane], s.slope_y = lanes.slope_y[lane];
+  s.id = i, s.depth = lanes.depth[lane], s.place = 0;
   return true;
 }
 
@@ -108,8 +100,10 @@ inline uint32_t prepare(const View& view, const Scene& scene, int i, int count, 
   const F extent = vmax(F(0.f), (log2_opacity - threshold) * F(kTwoLn2));
   const F half_difference = F(0.5f) * (p.a - p.c), spread = fma(half_difference, half_difference, p.b * p.b);
   const F largest = F(0.5f) * (p.a + p.c) + vsqrt(vmax(F(0.1f), spread));
-  store(lanes.radius, vceil(F(constants.radius_sigmas) * vsqrt(largest)));
-  store(lanes.reach_x, vsqrt(extent * p.a)), store(lanes.reach_y, vsqrt(extent * p.c));
+  const F radius = vceil(F(constants.radius_sigmas) * vsqrt(largest));
+  store(lanes.radius, radius);
+  ranges(lanes, 0, p.px, radius, vsqrt(extent * p.a), constants.tile, scene.camera.width);
+  ranges(lanes, 1, p.py, radius, vsqrt(extent * p.c), constants.tile, scene.camera.height);
   store(lanes.px, p.px), store(lanes.py, p.py), store(lanes.depth, p.z), store(lanes.lo, log2_opacity);
   const F ux = vsqrt(F(kHalfLog2e) * p.c / p.det), slope_x = p.b / p.c;
   store(lanes.ux, ux), store(lanes.uy, -(ux * slope_x)), store(lanes.vy, vsqrt(F(kHalfLog2e) / p.c));
