@@ -52,8 +52,6 @@ class TrackConfig:
     """Identity coefficients fitted."""
     iterations: int = 25
     """Levenberg-Marquardt iterations at most."""
-    photometric: bool = False
-    """Refine expression and head shape against the pixels after the landmark fit."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +80,8 @@ class TrainConfig:
     """Weight of the squared difference between rendered opacity and head matte."""
     mouth_weight: float = 100.0
     """Weight of the mouth Gaussians' squared distance outside the mouth volume."""
+    densify: bool = False
+    """Clone and split Gaussians where the image asks for more, and remove transparent ones."""
     loss: Literal["3dgb", "seed"] = "3dgb"
     """3dgb: the weights above; seed: the paper's printed variant (0.2 L1 + 0.8 D-SSIM, one mean over both
     mouth sets)."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from toonifygb.structures import TensorRecord
-from toonifygb.track.model import ANGLES, EXPRESSION, EYELIDS, POSITION, SURFACE, LandmarkModel, Posed, PoseState
+from toonifygb.track.model import ANGLES, EXPRESSION, EYELIDS, POSITION, LandmarkModel, Posed, PoseState
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -30,12 +30,13 @@ LID_PAIRS = (
 LIP_PAIRS = ((13, 14), (82, 87), (312, 317), (81, 178), (311, 402), (61, 291), (0, 17))
 """Landmarks whose distance says how far eyes and mouth are open: it is known better than either position."""
 
-DATA_SHARE = 2.0
+DATA_SHARE = 1.0
 """Weight of a landmark at one sigma against one sigma of a prior."""
-KERNEL = 3.0
+KERNEL = 5.0
 """Geman-McClure scale, sigmas: landmarks further off than this hardly count."""
-SIGMA_FLOOR = 0.8e-3
-"""No landmark is trusted better than this, m."""
+SIGMA_RANGE = (0.8e-3, 1.1e-3)
+"""Trust in a landmark is that of the detector, but no better and no worse than this, m. Contour landmarks, which
+wander most, would otherwise count next to nothing, although they alone say how wide the face is."""
 PAIR_SIGMA = 0.6e-3
 """Trust in a lid or lip gap, m."""
 FACING_EDGE, FACING_SOFTNESS, FACING_FLOOR = 0.05, 0.08, 0.05
@@ -43,8 +44,8 @@ FACING_EDGE, FACING_SOFTNESS, FACING_FLOOR = 0.05, 0.08, 0.05
 IRIS_WEIGHT = 0.8
 MIN_DEPTH = 0.05
 """A head nearer to the camera than this is no solution, m."""
-BATCH = 32
-"""Frames whose Jacobians are held at once: bounds memory to about 20 MB."""
+BATCH = 16
+"""Frames whose Jacobians are held at once: about 8 MB, near the size of a processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +156,7 @@ class LandmarkEnergy:
         self.model = model
         self.observation = observation
         self.pairs = torch.tensor(LID_PAIRS + LIP_PAIRS, device=observation.points.device)
-        self._trust = DATA_SHARE / model.sigma.clamp_min(SIGMA_FLOOR).square()
+        self._sigma = model.sigma.clamp(*SIGMA_RANGE)
 
     def residuals(self, posed: Posed, log_focal: Float[Tensor, ""]) -> Float[Tensor, "n l 2"]:
         """Projected minus detected landmarks, px."""
@@ -165,7 +166,7 @@ class LandmarkEnergy:
         """Weights at a state: robust kernel, patches turned away, closed eyes."""
         residuals = self.residuals(posed, log_focal)
         px_per_m = log_focal.exp() / -posed.points[..., 2].mean(-1, keepdim=True)
-        sigma_px = self.model.sigma.clamp_min(SIGMA_FLOOR) * px_per_m
+        sigma_px = self._sigma * px_per_m
         kernel = (1 + (residuals.norm(dim=-1) / (KERNEL * sigma_px)).square()).pow(-2)
         view = torch.nn.functional.normalize(-posed.points, dim=-1)
         cosine = ((self.model.normals @ state.rotation.mT) * view).sum(-1)
@@ -176,7 +177,7 @@ class LandmarkEnergy:
         irises = torch.stack([right] * 5 + [left] * 5, -1)
         facing = torch.cat([facing[:, :N_FACE], facing[:, N_FACE:] * irises], -1)
         return Weights(
-            landmark=self._trust * kernel * facing / px_per_m.square(),
+            landmark=DATA_SHARE * kernel * facing / sigma_px.square(),
             pair=DATA_SHARE * facing[:, self.pairs].amin(-1) / (PAIR_SIGMA * px_per_m).square(),
         )
 
@@ -206,17 +207,17 @@ class LandmarkEnergy:
             rigid: only rotation and position move.
             shared: identity and focal length move too; otherwise their parts are empty.
         """
-        residuals = self.residuals(posed, log_focal)
+        residuals = self.residuals(posed, log_focal)[..., None]
+        root = weights.landmark.sqrt()[..., None, None]
         parts = []
         for start in range(0, state.n, BATCH):
             part = slice(start, start + BATCH)
-            jacobian = self._jacobian(posed[part], state[part], log_focal, rigid, shared)
-            rows = torch.cat([jacobian, residuals[part, ..., None]], -1)
-            landmark = (rows * weights.landmark[part].sqrt()[..., None, None]).flatten(1, 2)
+            blocks = self._jacobian(posed[part], state[part], log_focal, rigid, shared)
+            rows = torch.cat([*blocks, residuals[part]], -1)
             gaps = rows[:, self.pairs[:, 0]] - rows[:, self.pairs[:, 1]]
             gaps = (gaps * weights.pair[part].sqrt()[..., None, None]).flatten(1, 2)
-            rows = torch.cat([landmark, gaps], 1)
-            parts.append(rows.mT @ rows)
+            rows = (rows * root[part]).flatten(1, 2)
+            parts.append(rows.mT @ rows + gaps.mT @ gaps)
         system = torch.cat(parts)
         p = 6 if rigid else 3 + self.model.n_values
         total = system[:, p:, p:].sum(0)
@@ -230,26 +231,14 @@ class LandmarkEnergy:
 
     def _jacobian(
         self, posed: Posed, state: PoseState, log_focal: Float[Tensor, ""], rigid: bool, shared: bool
-    ) -> Float[Tensor, "n l 2 c"]:
+    ) -> list[Float[Tensor, "n l 2 _"]]:
         """Derivatives of the projected landmarks: state, then (if shared) identity and log focal length, px."""
         slopes = projection_slopes(posed.points, log_focal)
         if rigid:
             arm = posed.points - state.values[:, None, POSITION]
-            return torch.cat([torch.linalg.cross(arm[:, :, None].expand_as(slopes), slopes, dim=-1), slopes], -1)
-        by_state, by_shape = self.model.derivatives(posed, state, slopes)
-        if not shared:
-            return by_state
-        from_centre = project(posed.points, log_focal, torch.zeros_like(self.observation.centre))
-        return torch.cat([by_state, by_shape, from_centre[..., None]], -1)
-
-
-__all__ = [
-    "SURFACE",
-    "LandmarkEnergy",
-    "NormalEquations",
-    "Observation",
-    "Prior",
-    "Weights",
-    "make_prior",
-    "project",
-]
+            return [torch.linalg.cross(arm[:, :, None].expand_as(slopes), slopes, dim=-1), slopes]
+        blocks = self.model.derivatives(posed, state, slopes)
+        if shared:
+            from_centre = project(posed.points, log_focal, torch.zeros_like(self.observation.centre))
+            blocks.append(from_centre[..., None])
+        return blocks

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-KEYFRAMES = 80
+KEYFRAMES = 64
 """Frames the identity is learned from; more change it by less than the landmarks' own bias."""
 CHUNK = 384
 """Frames whose motion is solved together."""

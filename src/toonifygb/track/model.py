@@ -12,7 +12,8 @@ R_j = R_y(b) R_x(a): opening and sideways for the jaw, pitch and yaw for an eye.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
@@ -153,16 +154,14 @@ class LandmarkModel(TensorRecord):
 
     def with_identity(self, shape: Float[Tensor, " s"]) -> LandmarkModel:
         """Model whose template is one person, with no identity coefficients left."""
-        return LandmarkModel(
-            **{
-                **self.__dict__,
-                "template": self.template + self.shape_basis @ shape,
-                "joints": self.joints + self.joint_shape_basis @ shape,
-                "root": self.root + self.root_shape_basis @ shape,
-                "shape_basis": self.shape_basis[..., :0],
-                "joint_shape_basis": self.joint_shape_basis[..., :0],
-                "root_shape_basis": self.root_shape_basis[..., :0],
-            }
+        return replace(
+            self,
+            template=self.template + self.shape_basis @ shape,
+            joints=self.joints + self.joint_shape_basis @ shape,
+            root=self.root + self.root_shape_basis @ shape,
+            shape_basis=self.shape_basis[..., :0],
+            joint_shape_basis=self.joint_shape_basis[..., :0],
+            root_shape_basis=self.root_shape_basis[..., :0],
         )
 
     def pose(self, shape: Float[Tensor, " s"], state: PoseState) -> Posed:
@@ -190,8 +189,8 @@ class LandmarkModel(TensorRecord):
 
     def derivatives(
         self, posed: Posed, state: PoseState, image: Float[Tensor, "n l 2 3"]
-    ) -> tuple[Float[Tensor, "n l 2 p"], Float[Tensor, "n l 2 s"]]:
-        """Derivatives of image positions by an update of the state and by the identity.
+    ) -> list[Float[Tensor, "n l 2 _"]]:
+        """Derivatives of image positions by an update of the state, then by the identity, as blocks of columns.
 
         Args:
             posed: ``pose(shape, state)``.
@@ -204,11 +203,16 @@ class LandmarkModel(TensorRecord):
         rest = head @ posed.linear
         # How a hinge's rest position moves a landmark: X changes by w_j (I − R_j) dJ_j.
         joint = -torch.einsum("lj,nlab,njbc->nlajc", self.skin_weights, head, posed.hinges).flatten(-2)
-        angles = self._angle_derivatives(posed, state, head, rest)
-        surface = _product(rest, self.surface_basis) + joint @ self.joint_surface_basis.flatten(0, 1)
-        by_state = torch.cat([turn, image, angles, surface], -1)
-        by_shape = _product(rest, self.shape_basis) + joint @ self.joint_shape_basis.flatten(0, 1)
-        return by_state, by_shape
+        levers = torch.cat([rest, joint], -1)
+        linear = torch.einsum("nlac,lcm->nlam", levers, self._lever_basis)
+        return [turn, image, self._angle_derivatives(posed, state, head, rest), linear]
+
+    @cached_property
+    def _lever_basis(self) -> Float[Tensor, "l 12 m"]:
+        """What surface and identity coefficients move: the landmark's rest point, then the hinges'."""
+        points = torch.cat([self.surface_basis, self.shape_basis], -1)
+        joints = torch.cat([self.joint_surface_basis, self.joint_shape_basis], -1).flatten(0, 1)
+        return torch.cat([points, joints.expand(len(points), -1, -1)], 1)
 
     def _angle_derivatives(
         self, posed: Posed, state: PoseState, head: Float[Tensor, "n l 2 3"], rest: Float[Tensor, "n l 2 3"]
@@ -262,10 +266,6 @@ def _axis_rotations(angles: Float[Tensor, "n 6"]) -> tuple[Float[Tensor, "n 3 3 
     about_x = torch.stack([one, zero, zero, zero, a.cos(), -a.sin(), zero, a.sin(), a.cos()], -1)
     about_y = torch.stack([b.cos(), zero, b.sin(), zero, one, zero, -b.sin(), zero, b.cos()], -1)
     return about_x.unflatten(-1, (3, 3)), about_y.unflatten(-1, (3, 3))
-
-
-def _product(rows: Float[Tensor, "n l 2 3"], basis: Float[Tensor, "l 3 m"]) -> Float[Tensor, "n l 2 m"]:
-    return torch.einsum("nlac,lcm->nlam", rows, basis)
 
 
 def patch_normals(points: Float[Tensor, "l 3"], radius: float) -> Float[Tensor, "l 3"]:

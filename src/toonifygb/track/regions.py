@@ -29,7 +29,7 @@ HAIR_UP, HAIR_OUT, FACE_OUT = 0.35, 0.30, 0.06
 front of the face (beards, glasses, noses the fit missed)."""
 NECK_OUT = 0.10
 """Widening of the neck about its axis, as a share."""
-NECK_LENGTH = 0.05
+NECK_LENGTH = 0.04
 """How much neck below the tip of the chin belongs to the head, m: about what a shirt leaves free."""
 NECK_BAND = 0.01
 """Half height of the ring of vertices that stands for the cut, m."""

@@ -54,8 +54,9 @@ ACCELERATION_SIGMAS = {
 }
 """How much faces accelerate per frame², rad, m and 1. A blink closes a lid in two or three frames: at this sigma
 it costs next to nothing."""
-CG_ITERATIONS = 40
-CG_TOLERANCE = 1e-4
+CG_ITERATIONS = 20
+CG_TOLERANCE = 1e-2
+"""Relative accuracy of a chain step; the next Gauss-Newton step makes up for the rest."""
 
 
 @dataclass(frozen=True)

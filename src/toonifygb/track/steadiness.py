@@ -48,9 +48,7 @@ POOR_ERROR_PX = 2.5
 def report(sequence: TrackedSequence) -> Report:
     """Figures of a track and sentences about its bridged stretches and poor fit."""
     error = float(sequence.error_px.nanmean())
-    problems = [
-        f"frames {_stretch(run)} have no usable face; the motion is bridged" for run in _lost(sequence.tracked)
-    ]
+    problems = [f"{_stretch(run)} no usable face; the motion is bridged" for run in _lost(sequence.tracked)]
     if error > POOR_ERROR_PX:
         problems.append(
             f"the mean landmark error is {error:.1f} px at 230 px face size, at most {POOR_ERROR_PX} px is expected"
@@ -66,4 +64,4 @@ def _lost(tracked: Tensor) -> list[tuple[int, int]]:
 
 
 def _stretch(run: tuple[int, int]) -> str:
-    return str(run[0]) if run[0] == run[1] else f"{run[0]} to {run[1]}"
+    return f"frame {run[0]} has" if run[0] == run[1] else f"frames {run[0]} to {run[1]} have"
