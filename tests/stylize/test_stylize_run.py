@@ -98,12 +98,18 @@ def test_threads_do_not_change_frames(name: str) -> None:
     assert same(one, two)
 
 
-def test_mattes_travel_with_the_frames() -> None:
-    clip, marks = scene.frames(5, 64, 48), scene.landmarks(5, 64, 48)
-    style = stylize.get("toon")
+def test_mattes_thin_out_the_background_of_ink() -> None:
+    clip, marks = scene.frames(5, 96, 80), scene.landmarks(5, 96, 80)
+    style = stylize.get("ink")
     state = stylize.prepare(iter(clip), marks, style)
-    mattes = (np.ones((48, 64), np.float32) for _ in clip)
-    assert len(list(stylize.stylize_frames(iter(clip), marks, style, state, mattes=mattes, chunk=2))) == 5
+    inside = np.zeros((80, 96), np.float32)
+    inside[20:, 30:66] = 1.0
+    mattes = (inside for _ in clip)
+    with_mattes = list(stylize.stylize_frames(iter(clip), marks, style, state, mattes=mattes, chunk=2))
+    without = list(stylize.stylize_frames(iter(clip), marks, style, state, chunk=2))
+    assert len(with_mattes) == 5
+    assert with_mattes[0][:, :20].mean() > without[0][:, :20].mean() + 1.0
+    assert np.array_equal(with_mattes[0][40:60, 40:55], without[0][40:60, 40:55])
 
 
 def test_frames_are_read_as_they_are_needed() -> None:

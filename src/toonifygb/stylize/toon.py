@@ -61,7 +61,9 @@ class Toon:
             "unit": unit,
             "has_skin": has_skin,
             "skin": [float(value) for value in middle],
-            "chroma": float(np.clip(26.0 / max(float(np.hypot(*middle[1:])), 1.0), 1.1, 1.35)),
+            "chroma": float(np.clip(26.0 / max(float(np.hypot(*middle[1:])), 1.0), 1.1, 1.3)),
+            # skin under cool light is drawn warmer, up to a hue of 40 degrees: pink faces look sore in flat colour
+            "warmth": float(np.clip(0.84 * middle[1] - middle[2], 0.0, 6.0)) if has_skin else 0.0,
             "tone_curve": filters.band_curve(levels, 1.6, 0.35, (float(middle[0]), gain)),
             "skin_curve": filters.band_curve(skin_levels, 1.2, 0.25, (float(middle[0]) - 12.0, 1.2)),
         }
@@ -137,5 +139,5 @@ def _shaded(fields: np.ndarray, state: dict[str, Any]) -> Lab:
     shade = smoothstep(2.0, 24.0, np.float32(state["skin"][0]) - banded) * skin
     chroma = mix(np.full_like(tone, 1.22), state["chroma"], skin)
     a = fields[..., 1] * chroma + 3.5 * shade
-    b = fields[..., 2] * chroma - 1.5 * shade
+    b = fields[..., 2] * chroma - 1.5 * shade + np.float32(state["warmth"]) * skin
     return cv2.merge([banded, a, b])
