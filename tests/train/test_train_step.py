@@ -20,6 +20,7 @@ from toonifygb.errors import InputError
 from toonifygb.progress import Stopped
 from toonifygb.structures import GaussianParams, Splats, TrackedSequence
 from toonifygb.train import Dataset, build_dataset, comparison, evaluate, first_avatar, train
+from toonifygb.train.densify import DensifyRules
 from toonifygb.train.losses import LossWeights, image_loss, mouth_loss
 from toonifygb.train.optim import DELTA_RATES, FULL_STEPS, NEUTRAL_RATES, means_decay, settling
 from toonifygb.train.state import TrainState, read_checkpoint, write_checkpoint
@@ -182,8 +183,15 @@ def test_fast_step_equals_the_plain_one(clip: tuple[Dataset, TrackedSequence]) -
             assert (expected != 0).any(), (group, name)
 
 
-def test_resumed_training_equals_a_straight_one(clip: tuple[Dataset, TrackedSequence], tmp_path: Path) -> None:
+@pytest.mark.parametrize("grow", [False, True])
+def test_resumed_training_equals_a_straight_one(
+    clip: tuple[Dataset, TrackedSequence], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grow: bool
+) -> None:
     dataset, sequence = clip
+    # A new generation every three steps, one of them between the checkpoint and its resumption.
+    eager = DensifyRules(first=0.1, last=0.9, every=3, face_threshold=1e-5, mouth_threshold=1e-5)
+    monkeypatch.setattr("toonifygb.train.densify.DensifyRules", lambda: eager)
+    config = replace(TINY, steps=20, densify=grow)
 
     class StopAt:
         def __init__(self, step: int) -> None:
@@ -195,14 +203,16 @@ def test_resumed_training_equals_a_straight_one(clip: tuple[Dataset, TrackedSequ
 
     def run(folder: Path, stop: int | None = None) -> Avatar | None:
         progress = StopAt(stop or -1)
-        return train(dataset, sequence, tiny_head(), replace(TINY, steps=20), folder, threads=2, progress=progress)
+        return train(dataset, sequence, tiny_head(), config, folder, threads=2, progress=progress)
 
     straight = run(tmp_path / "straight")
+    assert straight is not None
+    assert (straight.neutral.n > TINY.n_gaussians) == grow
     for stop in (1, 10):
         with pytest.raises(Stopped):
             run(tmp_path / "paused", stop)
     paused = run(tmp_path / "paused")
-    assert straight is not None and paused is not None
+    assert paused is not None
     assert same(straight, paused)
     finished_again = run(tmp_path / "paused")
     assert finished_again is not None and same(straight, finished_again)

@@ -22,6 +22,8 @@ import torch
 from toonifygb import __version__, render
 from toonifygb.avatar import init_avatar
 from toonifygb.progress import SILENT, Stopped
+from toonifygb.render import RenderInfo
+from toonifygb.train.densify import Densifier
 from toonifygb.train.state import TrainState, read_checkpoint, write_checkpoint
 from toonifygb.train.step import Stepper
 from toonifygb.train.views import TrainingViews
@@ -105,10 +107,11 @@ def first_avatar(dataset: Dataset, sequence: TrackedSequence, head: HeadModel, c
 def _run(stepper: Stepper, folder: Path, config: TrainConfig, dataset: Dataset, progress: Progress) -> None:
     """All remaining steps."""
     state, facts = stepper.state, {"fingerprint": _fingerprint(config, dataset)}
+    densifier = Densifier(stepper.first_counts, config.steps) if config.densify else None
     journal, saved = _Journal(folder / METRICS, state.step), time.monotonic()
     try:
         while state.step < config.steps:
-            terms = stepper.step()
+            terms = _step(stepper, densifier)
             figures = journal.note(state.step, terms, stepper)
             if time.monotonic() - saved > config.checkpoint_seconds:
                 write_checkpoint(state, folder / CHECKPOINT, facts)
@@ -118,6 +121,19 @@ def _run(stepper: Stepper, folder: Path, config: TrainConfig, dataset: Dataset, 
         write_checkpoint(state, folder / CHECKPOINT, facts)
         raise
     write_checkpoint(state, folder / CHECKPOINT, facts)
+
+
+def _step(stepper: Stepper, densifier: Densifier | None) -> LossTerms:
+    """One step, and a new generation of Gaussians after it when one is due."""
+    if densifier is None or not densifier.wanted(stepper.state.step + 1):
+        return stepper.step()
+    info = RenderInfo()
+    terms = stepper.step(info)
+    densifier.observe(stepper.state, info)
+    if densifier.due(stepper.state.step):
+        densifier.apply(stepper.state)
+        stepper.rebind()
+    return terms
 
 
 class _Journal:

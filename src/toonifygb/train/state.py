@@ -41,6 +41,12 @@ class Counts:
     upper: int
     lower: int
 
+    @classmethod
+    def of(cls, avatar: Avatar) -> Counts:
+        """The groups of an untrained avatar."""
+        n_moved = avatar.meta["n_moved"]
+        return cls(n_moved, avatar.neutral.n - n_moved, avatar.mouth_upper.n, avatar.mouth_lower.n)
+
     @property
     def face(self) -> int:
         """Both face groups."""
@@ -83,6 +89,10 @@ class TrainState:
     """Blendshape consistency: how far each expression delta may be trained."""
     skin_weights: Float[Tensor, "n 5"]
     pose_basis: Float[Tensor, "p face 3"]
+    pull: Float[Tensor, " n"]
+    """Densification statistic: sum over views of each Gaussian's image-space gradient."""
+    views: Float[Tensor, " n"]
+    """Views in that sum."""
     step: int
     """Steps done."""
     order: Int[Tensor, " t"]
@@ -94,8 +104,8 @@ class TrainState:
     @classmethod
     def start(cls, avatar: Avatar, seed: int) -> TrainState:
         """The state before the first step."""
-        n_moved = avatar.meta["n_moved"]
-        counts = Counts(n_moved, avatar.neutral.n - n_moved, avatar.mouth_upper.n, avatar.mouth_lower.n)
+        counts = Counts.of(avatar)
+        n_moved = counts.moved
         n_expression = avatar.n_expressions + avatar.n_eyelids
         expression = cut_deltas(cut(avatar.deltas, 0, n_expression), 0, n_moved)
         mouth = [
@@ -111,6 +121,8 @@ class TrainState:
             scale=consistency(expression.means),
             skin_weights=torch.cat([avatar.skin_weights, *mouth]),
             pose_basis=avatar.pose_basis.clone(),
+            pull=torch.zeros(counts.all),
+            views=torch.zeros(counts.all),
             step=0,
             order=torch.zeros(0, dtype=torch.int64),
             position=0,
@@ -142,7 +154,7 @@ class TrainState:
         )
 
 
-_TENSORS = ("scale", "skin_weights", "pose_basis", "order")
+_TENSORS = ("scale", "skin_weights", "pose_basis", "pull", "views", "order")
 _TRAINED = ("neutral", "expression", "driver")
 
 

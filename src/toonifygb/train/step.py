@@ -17,6 +17,7 @@ from toonifygb.render import RenderInfo
 from toonifygb.structures import GaussianParams, Splats
 from toonifygb.train.losses import LossTerms, LossWeights, image_gradients, mouth_loss
 from toonifygb.train.optim import Coefficients, Optimizer, blend
+from toonifygb.train.state import Counts
 
 if TYPE_CHECKING:
     from toonifygb.avatar import Avatar
@@ -55,6 +56,7 @@ class Stepper:
         kernels: Kernels,
     ) -> None:
         self.state = state
+        self.first_counts = Counts.of(template)
         self._dataset = dataset
         self._config = config
         self._renderer = renderer
