@@ -15,6 +15,7 @@ from toonifygb.errors import InputError
 from toonifygb.structures import VideoInfo
 from toonifygb.video import hdr
 from toonifygb.video.pixels import PictureFormat
+from toonifygb.video.sound import decodable_sound
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -51,7 +52,8 @@ class VideoFile:
         self._path = path
         with opened(path) as (container, stream):
             timing = _scan(container, stream)
-            has_audio = bool(container.streams.audio)
+            has_audio = decodable_sound(container) is not None
+            has_lost_audio = bool(container.streams.audio) and not has_audio
             opaque_only = stream.metadata.get("alpha_mode") == "1"
         with opened(path) as (container, stream):
             first = next(_pictures(container, stream, lambda _: None), None)
@@ -66,6 +68,8 @@ class VideoFile:
         if aspect != 1.0:
             done = f"stretched to {width}x{height} px" if stretched else "kept as they are"
             findings.append(f"has pixels {aspect:.3g} times as wide as high; {done}")
+        if has_lost_audio:
+            findings.append("has sound that cannot be decoded; it is left out")
         if interlaced:
             findings.append("is interlaced; moving edges show a comb")
         if opaque_only:

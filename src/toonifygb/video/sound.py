@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from av.container import InputContainer, OutputContainer
 
 _BIT_RATE = 192_000
-_MAX_RATE = 48_000
-"""Highest sample rate every player takes, Hz."""
+_RATES = (8_000, 11_025, 12_000, 16_000, 22_050, 24_000, 32_000, 44_100, 48_000)
+"""Sample rates AAC knows and every player takes, Hz; sound of any other is brought to the last."""
 
 
 class SoundTrack:
@@ -29,10 +29,9 @@ class SoundTrack:
     is left out as well: the frames matter more.
     """
 
-    def __init__(self, source: InputContainer, target: OutputContainer) -> None:
-        stream = source.streams.audio[0]
+    def __init__(self, source: InputContainer, stream: AudioStream, target: OutputContainer) -> None:
         self._source, self._target = source, target
-        self._rate = min(stream.rate, _MAX_RATE)
+        self._rate = stream.rate if stream.rate in _RATES else _RATES[-1]
         layout = "mono" if stream.codec_context.channels == 1 else "stereo"
         self._stream: AudioStream = target.add_stream("aac", rate=self._rate, layout=layout)
         self._stream.bit_rate = _BIT_RATE
@@ -86,18 +85,24 @@ class SoundTrack:
     def _lead(self, first: AudioFrame) -> int:
         """Samples by which the sound starts after the picture; negative when before."""
         video = next(iter(self._source.streams.video), None)
-        if video is None or video.start_time is None or video.time_base is None or first.time is None:
+        if video is None or video.start_time is None or not video.time_base or first.time is None:
             return 0
         return round((first.time - float(video.start_time * video.time_base)) * self._rate)
 
 
 def open_sound(path: str | os.PathLike[str], target: OutputContainer) -> SoundTrack | None:
-    """The sound of a clip as a track of ``target``; ``None`` when it has none, as a folder of images."""
+    """The sound of a clip as a track of ``target``; ``None`` when it has none that can be decoded."""
     try:
         source = av.open(f"file:{path}", options={"protocol_whitelist": "file"})
     except (FFmpegError, OSError):
         return None
-    if not source.streams.audio:
+    stream = decodable_sound(source)
+    if stream is None:
         source.close()
         return None
-    return SoundTrack(source, target)
+    return SoundTrack(source, stream, target)
+
+
+def decodable_sound(source: InputContainer) -> AudioStream | None:
+    """The first audio stream FFmpeg can decode; phones add spatial sound that it cannot."""
+    return next((stream for stream in source.streams.audio if stream.codec_context is not None), None)

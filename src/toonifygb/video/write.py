@@ -15,7 +15,7 @@ from av.error import FFmpegError
 
 from toonifygb.errors import InputError
 from toonifygb.video import pixels
-from toonifygb.video.sound import open_sound
+from toonifygb.video.sound import SoundTrack, open_sound
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -64,6 +64,8 @@ class Writer:
         self.path = Path(path)
         self.written_size = (width + width % 2, height + height % 2)
         self.n_frames = 0
+        self._finished = False
+        self._sound: SoundTrack | None = None
         self._size = (width, height)
         self._rate = exact_rate(fps)
         self._part = self.path.with_name(f"{self.path.stem}.part.mp4")
@@ -76,8 +78,10 @@ class Writer:
             # The whole index in front lets players start before the file has arrived.
             self._container = av.open(f"file:{self._part}", "w", format="mp4", options={"movflags": "+faststart"})
         try:
-            self._stream = self._add_video()
-            self._sound = None if audio_from is None else open_sound(audio_from, self._container)
+            with self._explained():
+                self._stream = self._add_video()
+                if audio_from is not None:
+                    self._sound = open_sound(audio_from, self._container)
         except BaseException:
             self._discard()
             raise
@@ -118,6 +122,7 @@ class Writer:
                     self._container.mux(self._stream.encode(None))
                     if self._sound is not None:
                         self._sound.finish()
+                    self._finished = True
                     self._container.close()
                     os.replace(self._part, self.path)
         finally:
@@ -152,12 +157,13 @@ class Writer:
 
     def _discard(self) -> None:
         """Removes whatever is unfinished; safe to call at any time, any number of times."""
-        sound = getattr(self, "_sound", None)
-        if sound is not None:
-            sound.close()
-        # Closing writes the index; on a full disk that fails again, which is no news.
-        with contextlib.suppress(FFmpegError, OSError):
-            self._container.close()
+        if self._sound is not None:
+            self._sound.close()
+        if not self._finished:
+            self._finished = True
+            # Closing writes the index; on a full disk that fails again, which is no news.
+            with contextlib.suppress(FFmpegError, OSError):
+                self._container.close()
         self._part.unlink(missing_ok=True)
 
     @contextlib.contextmanager
