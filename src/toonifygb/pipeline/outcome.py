@@ -101,8 +101,7 @@ def preview_panels(
         swing = _SWING_DEG * math.sin(2 * math.pi * index / period)
         yield [
             *(train.crop(frame, dataset.boxes[index], _PANEL) for frame in film),
-            viewer.frame(motion),
-            viewer.frame(motion, yaw_deg=swing),
+            *viewer.frames(motion, [(0.0, 0.0), (swing, 0.0)]),
         ]
 
 
@@ -175,7 +174,7 @@ def report_pictures(run: Run, config: RunConfig) -> dict[str, np.ndarray]:
             )
         )
     viewer.look_through(dataset.camera(dataset.split.train[len(dataset.split.train) // 2]))
-    views = [viewer.frame(middle, yaw_deg=yaw) for yaw in _VIEWS_DEG]
+    views = viewer.frames(middle, [(yaw, 0.0) for yaw in _VIEWS_DEG])
     faces = [viewer.frame(posed(model, weights)) for _, weights in _EXPRESSIONS]
     return {
         "1-held-out": pictures.stack(held_out),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -26,6 +27,7 @@ class AvatarViewer:
         threads: int | None = None,
     ) -> None:
         self.model = model
+        self._poser = avatars.Poser(model, backend=backend, threads=threads)
         self.renderer = render.get(backend, threads)
         self.background = background
         self.size = size
@@ -36,20 +38,26 @@ class AvatarViewer:
         self.camera = resized(camera, self.size)
 
     def frame(self, motion: HeadMotion, yaw_deg: float = 0.0, pitch_deg: float = 0.0) -> np.ndarray:
-        """uint8 RGB picture of one pose.
+        """uint8 RGB picture of one pose; angles as in ``frames``."""
+        return self.frames(motion, [(yaw_deg, pitch_deg)])[0]
+
+    def frames(self, motion: HeadMotion, angles_deg: Sequence[tuple[float, float]]) -> list[np.ndarray]:
+        """uint8 RGB pictures of one pose from several views.
 
         Args:
             motion: expression and pose, no batch axis.
-            yaw_deg: view turned towards the subject's left, degrees.
-            pitch_deg: view turned upwards, degrees.
+            angles_deg: (yaw, pitch) of each view about the head, degrees: yaw turns it towards the subject's left,
+                pitch upwards; (0, 0) is the camera itself.
         """
+        splats = self._poser(motion)
+        pivot = motion.translation + self.model.rest_joints[0]
+        pictures = []
         with torch.no_grad():
-            camera = self.camera
-            if yaw_deg or pitch_deg:
-                pivot = motion.translation + self.model.rest_joints[0]
-                camera = cameras.orbit(camera, pivot, math.radians(yaw_deg), math.radians(pitch_deg))
-            image = self.renderer.render(self.model.pose(motion), camera, background=self.background)
-        return to_uint8(image.color)
+            for yaw, pitch in angles_deg:
+                camera = cameras.orbit(self.camera, pivot, math.radians(yaw), math.radians(pitch))
+                image = self.renderer.render(splats, camera, background=self.background)
+                pictures.append(to_uint8(image.color))
+        return pictures
 
 
 _JAW_OPEN_RAD = 0.426
