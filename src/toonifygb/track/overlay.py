@@ -47,7 +47,11 @@ EYE_RIGHT = (33, 7, 163, 144, 145, 153, 154, 155, 133, 173, 157, 158, 159, 160, 
 EYE_LEFT = (263, 249, 390, 373, 374, 380, 381, 382, 362, 398, 384, 385, 386, 387, 388, 466)
 BROW_RIGHT = (46, 53, 52, 65, 55, 107, 66, 105, 63, 70)
 BROW_LEFT = (276, 283, 282, 295, 285, 336, 296, 334, 293, 300)
-IRIS_RIGHT, IRIS_LEFT = (469, 470, 471, 472), (474, 475, 476, 477)
+IRISES = ((474, 475, 476, 477), (469, 470, 471, 472))
+"""Four points around each iris, a quarter turn apart; the subject's left eye first, as in ``eyelids``."""
+IRIS_COLOR = (110, 240, 200)
+LID_HIDES_IRIS = 0.6
+"""Closure from which an iris is not drawn."""
 NOSE_RIDGE = (168, 6, 197, 195, 5, 4)
 NOSE_WING = (98, 97, 2, 326, 327)
 HOLES = (LIPS_INNER, EYE_RIGHT, EYE_LEFT)
@@ -60,8 +64,6 @@ CONTOURS: tuple[tuple[tuple[int, ...], bool, tuple[int, int, int], float], ...] 
     (NOSE_WING, False, (196, 240, 205), 0.9),
     (EYE_RIGHT, True, (255, 255, 255), 1.0),
     (EYE_LEFT, True, (255, 255, 255), 1.0),
-    (IRIS_RIGHT, True, (110, 240, 200), 1.0),
-    (IRIS_LEFT, True, (110, 240, 200), 1.0),
     (LIPS_OUTER, True, (255, 120, 140), 1.1),
     (LIPS_INNER, True, (255, 120, 140), 0.9),
 )
@@ -114,6 +116,8 @@ class _Pose:
     """Cosine between each landmark's normal and the viewer."""
     axes: Float[np.ndarray, "4 2"]
     """Origin and tips of the head's axes."""
+    eyelids: tuple[float, ...]
+    """Closure of left and right lid."""
 
     @property
     def face_size(self) -> float:
@@ -127,7 +131,13 @@ class _Pose:
             return (points - (left, top)) * scale
 
         return _Pose(
-            place(self.vertices), self.faces, self.shade, place(self.landmarks), self.facing, place(self.axes)
+            place(self.vertices),
+            self.faces,
+            self.shade,
+            place(self.landmarks),
+            self.facing,
+            place(self.axes),
+            self.eyelids,
         )
 
 
@@ -160,6 +170,7 @@ def _project(sequence: TrackedSequence, index: int, head: HeadModel) -> _Pose:
         landmarks=cameras.project(sequence.camera, points)[0].numpy(),
         facing=(landmark_normals * landmark_view).sum(-1).numpy(),
         axes=cameras.project(sequence.camera, tips)[0].numpy(),
+        eyelids=tuple(motion.eyelids.tolist()),
     )
 
 
@@ -235,6 +246,11 @@ def _contours(canvas: UInt8[np.ndarray, "h w 3"], pose: _Pose, width: float) -> 
         line = _fixed(_smooth(pose.landmarks[list(numbers)], closed))
         pen = max(1, round(weight * width * OVERSAMPLING))
         cv2.polylines(canvas, [line], closed, color, pen, cv2.LINE_AA, SHIFT)
+    pen = max(1, round(width * OVERSAMPLING))
+    for numbers, closure in zip(IRISES, pose.eyelids, strict=True):
+        if closure < LID_HIDES_IRIS:
+            ring = _fixed(_ellipse(pose.landmarks[list(numbers)]))
+            cv2.polylines(canvas, [ring], True, IRIS_COLOR, pen, cv2.LINE_AA, SHIFT)
 
 
 def _smooth(points: Float[np.ndarray, "n 2"], closed: bool, parts: int = 6) -> Float[np.ndarray, "m 2"]:
@@ -246,6 +262,13 @@ def _smooth(points: Float[np.ndarray, "n 2"], closed: bool, parts: int = 6) -> F
     curve = b + 0.5 * t * (c - a + t * (2 * a - 5 * b + 4 * c - d + t * (3 * (b - c) + d - a)))
     curve = curve.swapaxes(0, 1).reshape(-1, 2)
     return curve if closed else np.concatenate([curve, points[-1:]])
+
+
+def _ellipse(points: Float[np.ndarray, "4 2"], parts: int = 32) -> Float[np.ndarray, "m 2"]:
+    """Ellipse through four points that stand a quarter turn apart."""
+    angle = np.arange(parts)[:, None] * (2 * np.pi / parts)
+    across, along = (points[0] - points[2]) / 2, (points[1] - points[3]) / 2
+    return points.mean(0) + np.cos(angle) * across + np.sin(angle) * along
 
 
 def _axes(canvas: UInt8[np.ndarray, "h w 3"], pose: _Pose, width: float) -> None:
