@@ -65,7 +65,7 @@ def dress(materials: Materials, body: Body, look: Look, seed: int) -> Float32[np
     Returns:
         Where there is cloth, 0..1.
     """
-    below = body.refinement.spread(_below_collar(body, look))
+    below = body.refinement.spread(_below_collar(body))
     cloth = smoothstep(-0.0012, 0.0012, below)
     place = body.refinement.spread(body.rest)
     weave = 1 + 0.05 * value_noise(place, 900, seed + 61) + 0.06 * fractal_noise(place, 60, seed + 62)
@@ -81,7 +81,7 @@ def dress(materials: Materials, body: Body, look: Look, seed: int) -> Float32[np
 
 def make_rib(body: Body, look: Look) -> Rib:
     """The rib along the collar line."""
-    below = _below_collar(body, look)
+    below = _below_collar(body)
     skin = np.isin(body.part[body.faces[:, 0]], [PARTS.index("skin"), TORSO])
     faces = body.faces[skin]
     sides = np.unique(np.sort(np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2), 1), axis=0)
@@ -101,14 +101,12 @@ def make_rib(body: Body, look: Look) -> Rib:
     return Rib(ends[nearest], share[nearest], quads, linear(look.cloth) * 0.82)
 
 
-def _below_collar(body: Body, look: Look) -> Float32[np.ndarray, " v"]:
+def _below_collar(body: Body) -> Float32[np.ndarray, " v"]:
     """Signed height under the collar line, m: positive where there is cloth."""
     place = body.rest
     edge_height = float(place[neck_loop(body.head), 1].mean())
     angle = np.arctan2(place[:, 0], place[:, 2] - CHEST_Z)
     front = 0.5 + 0.5 * np.cos(angle)
     line = edge_height + 0.034 - 0.042 * front
-    if look.collar == "vee":
-        line = line - 0.055 * np.maximum(front - 0.80, 0) / 0.20
     head_part = np.isin(body.part, [PARTS.index("skin"), TORSO])
     return np.where(head_part, line - place[:, 1], -1.0).astype(np.float32)

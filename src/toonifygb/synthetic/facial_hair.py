@@ -20,13 +20,14 @@ if TYPE_CHECKING:
 
     from toonifygb.synthetic.body import Body, Pose
     from toonifygb.synthetic.look import Look
+    from toonifygb.synthetic.paint import Materials
 
 # MediaPipe's landmarks of the subject's right eye; the left ones are their mirrors.
 BROW_TOP = (70, 63, 105, 66, 107)
 BROW_BOTTOM = (46, 53, 52, 65, 55)
 LID_TOP = (33, 246, 161, 160, 159, 158, 157, 173)
 LID_BOTTOM = (33, 7, 163, 144, 145, 153, 154)
-HAIRS_PER_BROW, HAIRS_PER_LID_TOP, HAIRS_PER_LID_BOTTOM = 420, 44, 20
+HAIRS_PER_BROW, HAIRS_PER_LID_TOP, HAIRS_PER_LID_BOTTOM = 520, 40, 18
 POINTS_PER_HAIR = 5
 
 
@@ -56,14 +57,24 @@ class FacialHair:
         return Strands(points, outward, self.width, self.albedo, np.full(self.width.shape, 0.9, np.float32))
 
 
+def tint_brows(materials: Materials, body: Body, look: Look) -> None:
+    """Darkens the skin under the brows, where single hairs are too fine to be drawn."""
+    place = body.refinement.spread(body.canonical)
+    for mirrored in (False, True):
+        top, bottom = (_landmarks(body, ids, mirrored) for ids in (BROW_TOP, BROW_BOTTOM))
+        weight = 0.55 * look.brow_fullness * _brow_mask(place, top, bottom, 1.0 if mirrored else -1.0)[:, None]
+        brow = 0.5 * (linear(look.hair) + materials.albedo * 0.4)
+        materials.albedo[:] = materials.albedo * (1 - weight) + brow * weight
+
+
 def grow_facial_hair(body: Body, look: Look, seed: int) -> FacialHair:
     """Brows and lashes of a subject."""
     rng = np.random.Generator(np.random.Philox(seed + 2000))
     tufts = []
     for mirrored in (False, True):
         tufts.append(_brow(body, look, rng, mirrored, seed))
-        tufts.append(_lashes(body, rng, mirrored, LID_TOP, HAIRS_PER_LID_TOP, 0.0085, 1.0))
-        tufts.append(_lashes(body, rng, mirrored, LID_BOTTOM, HAIRS_PER_LID_BOTTOM, 0.0045, -1.0))
+        tufts.append(_lashes(body, rng, mirrored, LID_TOP, HAIRS_PER_LID_TOP, 0.0068, 1.0))
+        tufts.append(_lashes(body, rng, mirrored, LID_BOTTOM, HAIRS_PER_LID_BOTTOM, 0.0034, -1.0))
     return FacialHair(*(np.concatenate(fields) for fields in zip(*tufts, strict=True)))
 
 
@@ -84,14 +95,14 @@ def _brow(body: Body, look: Look, rng: np.random.Generator, mirrored: bool, seed
     span = np.abs(top[:, 0])
     along = ((np.abs(place[:, 0]) - span.min()) / (span.max() - span.min())).clip(0, 1)  # 0 inner end, 1 tail
     slope = np.interp(along, (0, 0.15, 0.6, 1.0), (1.25, 0.75, 0.15, -0.45)) + 0.22 * rng.standard_normal(n)
-    length = np.interp(along, (0, 0.3, 1.0), (0.0048, 0.0062, 0.0042)) * (0.75 + 0.5 * rng.random(n))
+    length = np.interp(along, (0, 0.3, 1.0), (0.0044, 0.0058, 0.0042)) * (0.75 + 0.5 * rng.random(n))
     progress = np.linspace(0, 1, POINTS_PER_HAIR)[None]
     bend = slope[:, None] - 0.5 * progress  # hairs curve down towards their tips
     side = sign * np.cos(np.arctan(bend)) * length[:, None] * progress
     up = np.sin(np.arctan(bend)) * length[:, None] * progress
     lift = 0.0003 + 0.0007 * np.sin(np.pi * 0.75 * progress) * (0.6 + 0.8 * rng.random((n, 1)))
     local = np.stack([side, up, np.broadcast_to(lift, side.shape)], -1)
-    width = 0.00050 * (1 - 0.7 * progress) * (0.7 + 0.6 * rng.random((n, 1)))
+    width = 0.00036 * (1 - 0.7 * progress) * (0.7 + 0.6 * rng.random((n, 1)))
     tone = 0.62 * (0.8 + 0.4 * rng.random((n, 1, 1))) * np.ones((1, POINTS_PER_HAIR, 1))
     return _pack(corners, bary.float().numpy(), local, width, tone * linear(look.hair))
 
@@ -136,14 +147,14 @@ def _lashes(
     progress = np.linspace(0, 1, POINTS_PER_HAIR)[None]
     reach = length_m * (0.8 + 0.4 * rng.random(n)) * np.interp(along, (0, 0.3, 1), (0.6, 1, 1))
     side = (0.55 * fan)[:, None] * progress
-    up = np.broadcast_to(upward * (-0.10 * progress + 0.85 * progress**2), side.shape)
+    up = np.broadcast_to(upward * (-0.16 * progress + 0.62 * progress**2), side.shape)
     forwards = np.broadcast_to(0.95 * progress - 0.25 * progress**2, side.shape)
     world = np.stack([side, up, forwards], -1) * reach[:, None, None]  # along the head's axes
     normal = unit(np.einsum("sj,sjc->sc", weights, body.rest_normals[vertices]))
     frame = np.stack(_frames(normal, np.array((1, 0, 0), np.float32)), 1)  # s 3 3: rows side, up, normal
     local = np.einsum("skc,sac->ska", world, frame)
     width = 0.00042 * (1 - 0.8 * progress) * np.ones((n, 1))
-    albedo = np.full((n, POINTS_PER_HAIR, 3), 0.006)
+    albedo = np.full((n, POINTS_PER_HAIR, 3), 0.010)
     return _pack(vertices, weights, local, width, albedo)
 
 

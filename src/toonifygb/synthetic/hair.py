@@ -213,13 +213,15 @@ def grow_hair(body: Body, look: Look, seed: int) -> Strands:
         ahead, near = _kept_near(
             points[-1] + step * direction, hull, hull_normals, height, style.slack_m * (0.3 + layer)
         )
+        ahead = _beside_the_face(ahead)
         direction = unit(ahead - points[-1])
         points.append(ahead)
         outward.append(near)
     path = np.stack(points, 1)
     if style.curl_m:
         path = _curled(path, style, rng)
-    return _finish(path, np.stack(outward, 1), layer, look, style, rng)
+    clear = ~_on_the_face(path).any(1)
+    return _finish(path[clear], np.stack(outward, 1)[clear], layer[clear], look, style, rng)
 
 
 def _roots(body: Body, style: Style, seed: int) -> tuple[Points, Points, Points]:
@@ -252,6 +254,20 @@ def _along_skin(direction: Points, normals: Points) -> Points:
     """Directions turned into the plane of the skin, unit."""
     flat = direction - np.einsum("ni,ni->n", direction, normals)[:, None] * normals
     return unit(flat.astype(np.float32))
+
+
+def _beside_the_face(points: Points) -> Points:
+    """Points moved sideways out of the way of forehead, eyes and cheeks."""
+    least = np.interp(points[:, 1], (-0.05, 0.06, 0.08, 0.095, 0.104), (0.066, 0.066, 0.055, 0.030, 0.0))
+    aside = np.where(points[:, 0] < 0, -1, 1) * np.maximum(np.abs(points[:, 0]), least)
+    x = np.where(points[:, 2] > 0.03, aside, points[:, 0])
+    return np.concatenate([x[:, None], points[:, 1:]], 1).astype(np.float32)
+
+
+def _on_the_face(points: Float32[np.ndarray, "s k 3"]) -> np.ndarray:
+    """Whether points lie in front of forehead, eyes and cheeks."""
+    x, y, z = np.abs(points[..., 0]), points[..., 1], points[..., 2]
+    return (z > 0.05) & (y < 0.088) & (x < 0.056)
 
 
 def _kept_near(
@@ -294,6 +310,7 @@ def _finish(
     n, k, _ = path.shape
     progress = np.linspace(0, 1, k, dtype=np.float32)[None]
     width = style.width_m * (0.75 + 0.5 * rng.random((n, 1))) * (1 - 0.75 * progress**2)
+    width = width * np.minimum(0.35 + 4 * progress, 1)  # fine at the root: a soft hairline
     tone = (0.72 + 0.56 * rng.random((n, 1, 1))) * (0.92 + 0.16 * progress[..., None])
     warm = 1 + 0.10 * rng.standard_normal((n, 1, 1)) * np.array((1.0, 0.0, -0.6))
     albedo = linear(look.hair) * tone * warm

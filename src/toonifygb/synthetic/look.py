@@ -38,7 +38,6 @@ class Look:
     freckles: float = 0.0
     lip_tint: float = 0.75
     """How strongly the lips take their colour, 0..1."""
-    collar: Literal["crew", "vee"] = "crew"
 
 
 LOOKS = (
@@ -50,7 +49,7 @@ LOOKS = (
         cloth=(46, 84, 104),
         wall=(196, 186, 172),
         style="bob",
-        shape_seed=11,
+        shape_seed=10,
         shoulders=0.192,
         brow_fullness=0.85,
         freckles=0.35,
@@ -64,7 +63,7 @@ LOOKS = (
         cloth=(214, 168, 72),
         wall=(150, 168, 176),
         style="curly",
-        shape_seed=5,
+        shape_seed=3,
         stubble=0.55,
         lip_tint=0.6,
     ),
@@ -76,7 +75,7 @@ LOOKS = (
         cloth=(120, 54, 58),
         wall=(168, 174, 160),
         style="short",
-        shape_seed=7,
+        shape_seed=4,
         stubble=0.35,
         lip_tint=0.6,
     ),
@@ -88,11 +87,10 @@ LOOKS = (
         cloth=(208, 204, 196),
         wall=(178, 164, 170),
         style="swept",
-        shape_seed=3,
+        shape_seed=6,
         shoulders=0.195,
         brow_fullness=0.95,
         lip_tint=0.85,
-        collar="vee",
     ),
 )
 """Four people; every further seed is one of them with other features and colours."""

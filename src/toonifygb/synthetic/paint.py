@@ -108,8 +108,8 @@ def skin_tint(place: Points, look: Look, seed: int) -> Points:
     tint = np.ones_like(place, np.float32)
     tint *= 1 + blotch[:, None] * (0.03, 0.07, 0.07) + 0.035 * fine[:, None]
     face = smoothstep(0.03, 0.06, place[:, 2])
-    tint *= _toward((1.02, 0.74, 0.74), 0.75 * _spot(mirrored, (0.045, 0.004, 0.08), (0.020, 0.018, 0.03)))
-    tint *= _toward((1.02, 0.78, 0.76), 0.6 * _spot(place, (0.0, 0.0, 0.113), (0.013, 0.011, 0.02)))
+    tint *= _toward((1.02, 0.74, 0.74), 0.42 * _spot(mirrored, (0.045, 0.004, 0.08), (0.020, 0.018, 0.03)))
+    tint *= _toward((1.02, 0.78, 0.76), 0.4 * _spot(place, (0.0, 0.0, 0.113), (0.013, 0.011, 0.02)))
     tint *= _toward((1.0, 0.86, 0.84), 0.5 * _spot(place, (0.0, -0.058, 0.1), (0.02, 0.013, 0.03)))
     tint *= _toward((0.86, 0.78, 0.84), 0.8 * _spot(mirrored, (0.029, 0.026, 0.085), (0.014, 0.007, 0.02)))
     tint *= _toward((0.90, 0.80, 0.80), 0.7 * _spot(mirrored, (0.030, 0.046, 0.088), (0.018, 0.006, 0.02)))

@@ -65,6 +65,7 @@ def make_subject(seed: int) -> Subject:
     coefficients = look.shape_spread * rng.standard_normal(head.n_shape)
     body = make_body(head, torch.from_numpy(coefficients.astype(np.float32)), look)
     materials = paint(body, look, seed)
+    facial_hair.tint_brows(materials, body, look)
     hair.cover_scalp(materials, body, look, seed)
     cloth = clothes.dress(materials, body, look, seed)
     materials.bump[:] = _relief(body, materials)
