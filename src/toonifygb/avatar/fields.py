@@ -56,7 +56,7 @@ def extended(deltas: GaussianParams, n: int) -> GaussianParams:
 
 def rows(tensor: Float[Tensor, "k n *c"]) -> Float[Tensor, "k p"]:
     """Deltas of one field as the matrix that the kernels stream through; a view."""
-    return tensor.view(tensor.shape[0], -1)
+    return tensor.flatten(1)
 
 
 def last_changed(deltas: GaussianParams) -> int:

@@ -1,8 +1,8 @@
 """Density control: more Gaussians where the image pulls at them, fewer where they are transparent.
 
 After 3D Gaussian Blendshapes (3DGB). The statistic is the mean over views of the length of the colour loss'
-gradient for a Gaussian's place on the image. Where it is large, a small Gaussian is cloned and a large one split in two;
-children inherit everything else from their parent: deltas, skinning, consistency. Their moments start at zero.
+gradient for a Gaussian's place on the image. Where it is large, a small Gaussian is cloned and a large one split in
+two; children inherit everything else from their parent: deltas, skinning, consistency. Their moments start at zero.
 """
 
 from __future__ import annotations
