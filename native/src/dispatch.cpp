@@ -51,3 +51,6 @@ TGB_API int tgb_set_isa(const char* name) {
   if (found != nullptr) tgb::chosen = found;
   return found != nullptr;
 }
+
+// Busies one core with fused multiply-adds; returns their number of floating-point operations.
+TGB_API double tgb_measure_flops() { return tgb::kernels().measure_flops(); }

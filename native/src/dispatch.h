@@ -18,6 +18,7 @@ struct Kernels {
   void (*blend_adam)(const BlendState& state, const AdamRates& adam_rates, int threads);
   double (*l1_dssim)(const float* image, const float* target, int height, int width, float l1_weight,
                      float dssim_weight, float* gradient, SimilarityWork& work, int threads);
+  double (*measure_flops)();
 };
 
 // The kernels of the best instruction set this machine has, or of the one set_isa chose.

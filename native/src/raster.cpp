@@ -87,7 +87,12 @@ TGB_API void tgb_raster_release(tgb::Frame* frame) {
   free_frames.push_back(frame);
 }
 
-// Sizes of a frame: visible Gaussians, (Gaussian, tile) pairs, tiles.
+// Sizes of a frame: visible Gaussians, (Gaussian, tile) pairs, tiles, and 4 x 4 px blocks composited over all pairs.
 TGB_API void tgb_raster_counts(const tgb::Frame* frame, int32_t* counts) {
-  counts[0] = frame->visible, counts[1] = static_cast<int32_t>(frame->pairs), counts[2] = frame->tiles_x * frame->tiles_y;
+  const int tiles = frame->tiles_x * frame->tiles_y;
+  int32_t blocks = 0;
+  for (int tile = 0; tile < tiles; tile++)
+    for (uint32_t i = 0; i < frame->tile_used[tile]; i++)
+      blocks += __builtin_popcountll(frame->masks[frame->tile_begin[tile] + i]);
+  counts[0] = frame->visible, counts[1] = static_cast<int32_t>(frame->pairs), counts[2] = tiles, counts[3] = blocks;
 }

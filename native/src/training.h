@@ -9,7 +9,7 @@ namespace tgb {
 
 // Mirrored field by field in src/toonifygb/render/library.py.
 struct AdamRates {
-  double beta1, beta2, eps;
+  double beta1, beta2, eps, factor;  // factor: of all learning rates
   int64_t step;  // counts from 1
 };
 

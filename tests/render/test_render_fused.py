@@ -45,6 +45,9 @@ def test_blend_is_the_weighted_sum(kernels: Kernels, dtype: torch.dtype, p: int)
     expected = base.double() + (psi.double()[:, None] * deltas.double()).sum(0)
     torch.testing.assert_close(kernels.blend(base, deltas, psi).double(), expected, rtol=0, atol=5e-6)
     assert torch.equal(kernels.blend(base, deltas, torch.zeros(K)), base)
+    blended = kernels.blend(base, deltas, psi)
+    assert kernels.blend(base, deltas, psi, out=base) is base
+    assert torch.equal(base, blended)
 
 
 def test_blend_does_not_read_inactive_rows(kernels: Kernels) -> None:
@@ -57,13 +60,13 @@ def test_adam_step_is_torch_adam(kernels: Kernels) -> None:
     dtype = torch.float64 if kernels.name == "reference" else torch.float32
     ours = torch.randn(999, dtype=dtype)
     theirs = ours.to(torch.float64, copy=True).requires_grad_()
-    optimizer = torch.optim.Adam([theirs], lr=1e-2, betas=(0.9, 0.999), eps=1e-15)
+    optimizer = torch.optim.Adam([theirs], lr=5e-3, betas=(0.9, 0.999), eps=1e-15)
     state = (ours, torch.zeros_like(ours), torch.zeros_like(ours))
     for step in range(1, 8):
         gradient = torch.randn(999, dtype=dtype) * torch.logspace(-6, 3, 999, dtype=dtype)
         theirs.grad = gradient.double()
         optimizer.step()
-        kernels.adam_step(*state, gradient, torch.full((999,), 1e-2, dtype=dtype), step)
+        kernels.adam_step(*state, gradient, torch.full((999,), 1e-2, dtype=dtype), step, factor=0.5)
     torch.testing.assert_close(
         ours.double(), theirs.detach(), rtol=0, atol=1e-12 if dtype == torch.float64 else 2e-6
     )
@@ -105,7 +108,7 @@ def test_native_blend_adam_agrees(
     expected = doubles(found)
     for step in range(1, 6):
         psi, gradient = coefficients().roll(step), torch.randn(P)
-        options = {"widths": WIDTHS, "skip_inactive": skip_inactive}
+        options = {"widths": WIDTHS, "skip_inactive": skip_inactive, "factor": 0.5 + 0.1 * step}
         native_kernels.blend_adam_step(*found, psi, gradient, rates, step, scale=scale, **options)
         wide_scale = None if scale is None else scale.double()
         DEFINITION.blend_adam_step(*expected, *doubles((psi, gradient, rates)), step, scale=wide_scale, **options)

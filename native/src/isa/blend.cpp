@@ -58,7 +58,8 @@ void blend_typed(const float* base, const T* deltas, const float* psi, int k, in
       }
       source = out + begin;
     }
-    if (source != out + begin) memcpy(out + begin, base + begin, count * sizeof(float));
+    if (source != out + begin)
+      memcpy(out + begin, base + begin, count * sizeof(float));
   });
 }
 
@@ -69,7 +70,7 @@ struct AdamFactors {
     beta1 = static_cast<float>(r.beta1), rest1 = static_cast<float>(1 - r.beta1);
     beta2 = static_cast<float>(r.beta2), rest2 = static_cast<float>(1 - r.beta2);
     eps = static_cast<float>(r.eps);
-    correct1 = static_cast<float>(1 / (1 - pow(r.beta1, step)));
+    correct1 = static_cast<float>(r.factor / (1 - pow(r.beta1, step)));
     correct2 = static_cast<float>(1 / sqrt(1 - pow(r.beta2, step)));
   }
 };

@@ -21,6 +21,7 @@ void adam(float* parameters, float* first, float* second, const float* gradient,
 void blend_adam(const BlendState& state, const AdamRates& adam_rates, int threads);
 double l1_dssim(const float* image, const float* target, int height, int width, float l1_weight, float dssim_weight,
                 float* gradient, SimilarityWork& work, int threads);
+double measure_flops();
 
 }  // namespace TGB_ISA
 }  // namespace tgb

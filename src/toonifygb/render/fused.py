@@ -29,7 +29,12 @@ class Kernels(Protocol):
     name: str
 
     def blend(
-        self, base: Float[Tensor, " p"], deltas: Float[Tensor, "k p"], psi: Float[Tensor, " k"]
+        self,
+        base: Float[Tensor, " p"],
+        deltas: Float[Tensor, "k p"],
+        psi: Float[Tensor, " k"],
+        *,
+        out: Float[Tensor, " p"] | None = None,
     ) -> Float[Tensor, " p"]:
         """B = B0 + Σ ψ_k ΔB_k (Eq. 2 of ToonifyGB); rows whose ψ_k is 0 are not read.
 
@@ -37,6 +42,7 @@ class Kernels(Protocol):
             base: B0.
             deltas: float32, or bfloat16 to halve the memory traffic.
             psi: expression coefficients.
+            out: where to put the result; may be ``base``.
         """
         ...
 
@@ -48,6 +54,8 @@ class Kernels(Protocol):
         gradient: Float[Tensor, " p"],
         learning_rates: Float[Tensor, " p"],
         step: int,
+        *,
+        factor: float = 1.0,
     ) -> None:
         """One step of Adam with a learning rate per parameter.
 
@@ -58,6 +66,7 @@ class Kernels(Protocol):
             gradient: of the loss.
             learning_rates: see ``learning_rates``.
             step: number of this step, from 1.
+            factor: of all learning rates.
         """
         ...
 
@@ -71,6 +80,7 @@ class Kernels(Protocol):
         learning_rates: Float[Tensor, " p"],
         step: int,
         *,
+        factor: float = 1.0,
         scale: Float[Tensor, "k n"] | None = None,
         widths: Sequence[int] = (),
         skip_inactive: bool = False,
@@ -89,6 +99,7 @@ class Kernels(Protocol):
             gradient: g, with respect to the blended parameters.
             learning_rates: per parameter.
             step: number of this step, from 1.
+            factor: of all learning rates.
             scale: factor of the step per row and Gaussian; where it is 0 the delta stays as it is, and its moments
                 mean nothing.
             widths: floats per Gaussian of each parameter group in the flat vector, in order; needed with ``scale``.
@@ -148,11 +159,17 @@ class ReferenceKernels:
     name = "reference"
 
     def blend(
-        self, base: Float[Tensor, " p"], deltas: Float[Tensor, "k p"], psi: Float[Tensor, " k"]
+        self,
+        base: Float[Tensor, " p"],
+        deltas: Float[Tensor, "k p"],
+        psi: Float[Tensor, " k"],
+        *,
+        out: Float[Tensor, " p"] | None = None,
     ) -> Float[Tensor, " p"]:
         """See ``Kernels.blend``."""
         active = psi.nonzero()[:, 0]
-        return base + psi[active] @ deltas[active].to(base.dtype)
+        blended = base + psi[active] @ deltas[active].to(base.dtype)
+        return blended if out is None else out.copy_(blended)
 
     def adam_step(
         self,
@@ -162,12 +179,14 @@ class ReferenceKernels:
         gradient: Float[Tensor, " p"],
         learning_rates: Float[Tensor, " p"],
         step: int,
+        *,
+        factor: float = 1.0,
     ) -> None:
         """See ``Kernels.adam_step``."""
         first_moment.mul_(BETA1).add_((1 - BETA1) * gradient)
         second_moment.mul_(BETA2).add_((1 - BETA2) * gradient * gradient)
         mean, square = first_moment / (1 - BETA1**step), second_moment / (1 - BETA2**step)
-        parameters.sub_(learning_rates * mean / (square.sqrt() + EPS))
+        parameters.sub_(factor * learning_rates * mean / (square.sqrt() + EPS))
 
     def blend_adam_step(
         self,
@@ -179,6 +198,7 @@ class ReferenceKernels:
         learning_rates: Float[Tensor, " p"],
         step: int,
         *,
+        factor: float = 1.0,
         scale: Float[Tensor, "k n"] | None = None,
         widths: Sequence[int] = (),
         skip_inactive: bool = False,
@@ -194,7 +214,7 @@ class ReferenceKernels:
                 rates = learning_rates * expand_scale(scale[k : k + 1], widths)[0]
                 live = rates != 0
             delta, first, second = deltas[k][live], first_moment[k][live], second_moment[k][live]
-            self.adam_step(delta, first, second, psi[k] * gradient[live], rates[live], step)
+            self.adam_step(delta, first, second, psi[k] * gradient[live], rates[live], step, factor=factor)
             deltas[k, live], first_moment[k, live], second_moment[k, live] = delta, first, second
 
     def l1_dssim(

@@ -83,7 +83,7 @@ class Gradients(Structure):
 class AdamRates(Structure):
     """Mirrors ``tgb::AdamRates`` of native/src/training.h."""
 
-    _fields_ = [("beta1", c_double), ("beta2", c_double), ("eps", c_double), ("step", c_int64)]
+    _fields_ = [*((name, c_double) for name in ("beta1", "beta2", "eps", "factor")), ("step", c_int64)]
 
 
 class BlendState(Structure):
@@ -104,6 +104,7 @@ _SIGNATURES = {
     "tgb_raster_backward": (c_int32, [c_void_p, POINTER(Scene), POINTER(Gradients), POINTER(c_double)]),
     "tgb_raster_release": (None, [c_void_p]),
     "tgb_raster_counts": (None, [c_void_p, POINTER(c_int32)]),
+    "tgb_measure_flops": (c_double, []),
     "tgb_blend": (None, [c_void_p, c_void_p, c_int32, c_void_p, c_int32, c_int64, c_void_p, c_int32]),
     "tgb_adam": (None, [*[c_void_p] * 5, c_int64, POINTER(AdamRates), c_int32]),
     "tgb_blend_adam": (None, [POINTER(BlendState), POINTER(AdamRates), c_int32]),

@@ -31,8 +31,8 @@ def _address(tensor: Tensor, name: str, shape: tuple[int, ...], dtype: torch.dty
     return tensor.data_ptr()
 
 
-def _rates(step: int) -> library.AdamRates:
-    return library.AdamRates(beta1=BETA1, beta2=BETA2, eps=EPS, step=step)
+def _rates(step: int, factor: float) -> library.AdamRates:
+    return library.AdamRates(beta1=BETA1, beta2=BETA2, eps=EPS, factor=factor, step=step)
 
 
 class NativeKernels:
@@ -52,12 +52,17 @@ class NativeKernels:
         self.threads = threads or available_threads()
 
     def blend(
-        self, base: Float[Tensor, " p"], deltas: Float[Tensor, "k p"], psi: Float[Tensor, " k"]
+        self,
+        base: Float[Tensor, " p"],
+        deltas: Float[Tensor, "k p"],
+        psi: Float[Tensor, " k"],
+        *,
+        out: Float[Tensor, " p"] | None = None,
     ) -> Float[Tensor, " p"]:
         """See ``Kernels.blend``."""
         k, p = deltas.shape
         half = deltas.dtype == torch.bfloat16
-        out = torch.empty(p)
+        out = torch.empty(p) if out is None else out
         self._engine.tgb_blend(
             _address(base, "base", (p,)),
             _address(deltas, "deltas", (k, p), torch.bfloat16 if half else torch.float32),
@@ -65,7 +70,7 @@ class NativeKernels:
             _address(psi, "psi", (k,)),
             k,
             p,
-            out.data_ptr(),
+            _address(out, "out", (p,)),
             self.threads,
         )
         return out
@@ -78,6 +83,8 @@ class NativeKernels:
         gradient: Float[Tensor, " p"],
         learning_rates: Float[Tensor, " p"],
         step: int,
+        *,
+        factor: float = 1.0,
     ) -> None:
         """See ``Kernels.adam_step``."""
         shape = (parameters.numel(),)
@@ -88,7 +95,7 @@ class NativeKernels:
             _address(gradient, "gradient", shape),
             _address(learning_rates, "learning_rates", shape),
             parameters.numel(),
-            _rates(step),
+            _rates(step, factor),
             self.threads,
         )
 
@@ -102,6 +109,7 @@ class NativeKernels:
         learning_rates: Float[Tensor, " p"],
         step: int,
         *,
+        factor: float = 1.0,
         scale: Float[Tensor, "k n"] | None = None,
         widths: Sequence[int] = (),
         skip_inactive: bool = False,
@@ -127,7 +135,7 @@ class NativeKernels:
             groups=len(groups),
             skip_inactive=skip_inactive,
         )
-        self._engine.tgb_blend_adam(state, _rates(step), self.threads)
+        self._engine.tgb_blend_adam(state, _rates(step, factor), self.threads)
 
     def l1_dssim(
         self,

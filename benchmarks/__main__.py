@@ -1,0 +1,30 @@
+"""``python -m benchmarks``: every benchmark; ``python -m benchmarks rasterizer``: one of them."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import sys
+
+import benchmarks
+from benchmarks import harness
+
+SUPPORT = {"__main__", "harness", "scenes", "limits"}
+
+
+def main(arguments: list[str]) -> int:
+    """Runs the named benchmarks, or all; prints their tables and appends their figures to the history."""
+    available = sorted({module.name for module in pkgutil.iter_modules(benchmarks.__path__)} - SUPPORT)
+    unknown = [name for name in arguments if name not in available]
+    if unknown:
+        print(f"no benchmark {', '.join(unknown)}; there are: {', '.join(available)}", file=sys.stderr)
+        return 2
+    for name in arguments or available:
+        figures = importlib.import_module(f"benchmarks.{name}").run()
+        harness.show(name, figures)
+        harness.record(name, figures)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
