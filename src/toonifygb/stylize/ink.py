@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     Lab = Float[np.ndarray, "h w 3"]
     Points = Float[np.ndarray, "478 2"]
 
-WORK_FACE_PX = 180
+WORK_FACE_PX = 150
 """Width of the face at which lines are found."""
 PAPER = np.array([0.975, 0.960, 0.925], np.float32)
 """sRGB of the sheet."""

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from toonifygb.stylize import filters, textures
-from toonifygb.stylize.anchors import face_unit, feature_mask, frontal, skin_pixels
+from toonifygb.stylize.anchors import OVAL, box_around, face_unit, feature_mask, frontal, is_empty, skin_pixels
 from toonifygb.stylize.exaggerate import Exaggeration
 from toonifygb.stylize.filters import mix, smoothstep
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     Lab = Float[np.ndarray, "h w 3"]
     Points = Float[np.ndarray, "478 2"]
 
-WORK_FACE_PX = 180
+WORK_FACE_PX = 140
 """Width of the face at which dabs are laid."""
 STROKE_REST = (1.05, 1.5)
 """Direction (rad) of the brush where the picture has none, and the strength of that habit."""
@@ -74,8 +74,10 @@ class Paint:
         dabs = filters.kuwahara(dabs, tangents, clarity, 0.03 * unit)
         if presence > 0:
             keep = feature_mask(lab.shape[:2], points * scale, unit) * np.float32(presence)
-            finer = filters.kuwahara(lab, tangents, clarity, 0.011 * unit)
-            dabs = mix(dabs, finer, keep)
+            box = box_around((points * scale)[list(OVAL)], 0.0, lab.shape)
+            if not is_empty(box):
+                finer = filters.kuwahara(lab[box], tangents[box], clarity[box], 0.011 * unit)
+                dabs[box] = mix(dabs[box], finer, keep[box])
         relief = _relief(lab.shape[:2], points * scale, presence, tangents, unit, state["template"] * scale)
         fields = filters.resize(np.dstack([dabs, relief]), width, height)
         lit = _lit(fields[..., :3], fields[..., 3], state)

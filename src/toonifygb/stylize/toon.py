@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     Lab = Float[np.ndarray, "h w 3"]
     Points = Float[np.ndarray, "478 2"]
 
-WORK_FACE_PX = 150
+WORK_FACE_PX = 140
 """Width of the face at which regions are simplified; more shows pores, less loses nostrils."""
 INK = np.array([0.17, 0.09, 0.13], np.float32)
 """sRGB of the lines: a warm near-black, which sits better on skin than pure black."""
