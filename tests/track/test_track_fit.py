@@ -14,7 +14,7 @@ from toonifygb.config import TrackConfig
 from toonifygb.errors import FaceError, InputError
 from toonifygb.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from toonifygb.structures import Landmarks, TrackedSequence
-from toonifygb.track import fitting
+from toonifygb.track import fitting, gaps
 
 CONFIG = TrackConfig(n_shape=N_SHAPE)
 
@@ -108,6 +108,13 @@ def test_a_frame_that_leaps_away_is_bridged(truth: TrackedSequence) -> None:
     assert fit.tracked.logical_not().nonzero().flatten().tolist() == [5]
     around = fit.motion.translation[4:7]
     assert (around[1] - (around[0] + around[2]) / 2).norm() < 1e-4
+
+
+def test_quick_motion_in_a_slow_clip_is_no_leap(truth: TrackedSequence) -> None:
+    points = truth.landmarks.points.clone()
+    points[5] += torch.tensor([90.0, -40.0])
+    assert gaps.jumps(points, 25.0).nonzero().flatten().tolist() == [5]
+    assert not bool(gaps.jumps(points, 5.0).any())
 
 
 def test_a_frame_that_is_no_face_is_bridged(truth: TrackedSequence) -> None:

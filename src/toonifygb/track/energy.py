@@ -34,9 +34,10 @@ DATA_SHARE = 1.0
 """Weight of a landmark at one sigma against one sigma of a prior."""
 KERNEL = 5.0
 """Geman-McClure scale, sigmas: landmarks further off than this hardly count."""
-SIGMA_RANGE = (0.8e-3, 1.1e-3)
-"""Trust in a landmark is that of the detector, but no better and no worse than this, m. Contour landmarks, which
-wander most, would otherwise count next to nothing, although they alone say how wide the face is."""
+SIGMA_SHARE, SIGMA_RANGE = 0.7, (0.7e-3, 1.1e-3)
+"""Trust in a landmark: this share of the detector's wander on the surface (the rest is common to the whole face and
+moves with the pose), within bounds, m. Lips and lids count most; without the upper bound contour landmarks, which
+wander most, would count next to nothing, although they alone say how wide the face is."""
 PAIR_SIGMA = 0.6e-3
 """Trust in a lid or lip gap, m."""
 FACING_EDGE, FACING_SOFTNESS, FACING_FLOOR = 0.05, 0.08, 0.05
@@ -156,7 +157,7 @@ class LandmarkEnergy:
         self.model = model
         self.observation = observation
         self.pairs = torch.tensor(LID_PAIRS + LIP_PAIRS, device=observation.points.device)
-        self._sigma = model.sigma.clamp(*SIGMA_RANGE)
+        self._sigma = (SIGMA_SHARE * model.sigma).clamp(*SIGMA_RANGE)
 
     def residuals(self, posed: Posed, log_focal: Float[Tensor, ""]) -> Float[Tensor, "n l 2"]:
         """Projected minus detected landmarks, px."""

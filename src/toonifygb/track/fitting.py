@@ -71,7 +71,7 @@ def fit(
         InputError: a focal length or frame rate that is not positive.
     """
     _check(landmarks, fps, focal_px)
-    valid = landmarks.valid & ~gaps.jumps(landmarks.points)
+    valid = landmarks.valid & ~gaps.jumps(landmarks.points, fps)
     clip = _Clip(landmarks, head, config, fps)
     frames = valid.nonzero()[:, 0]
     shared = clip.learn_identity(frames, focal_px)

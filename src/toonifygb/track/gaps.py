@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from toonifygb.structures import HeadMotion
 
 JUMP_LEAST = 0.12
-"""A face that leaves the line between its neighbours by less than this share of its size is never a jump: at 25
-frames per second that is an acceleration no neck produces."""
+"""A face that leaves the line between its neighbours by less than this share of its size is never a jump. At
+``JUMP_FPS`` and above that is an acceleration no neck produces; slower clips are given more, in proportion."""
+JUMP_FPS = 25.0
 JUMP_RATIO = 2.5
 """... nor one that leaves it by less than this times its neighbours' own distance."""
 MISFIT_RATIO = 4.0
@@ -27,11 +28,12 @@ MISFIT_LEAST_PX = 5.0
 """... unless it is below this, px at 230 px face width."""
 
 
-def jumps(points: Float[Tensor, "t l 2"]) -> Bool[Tensor, " t"]:
+def jumps(points: Float[Tensor, "t l 2"], fps: float) -> Bool[Tensor, " t"]:
     """Single frames in which the landmarks leap away and back: another face, or a detector's slip.
 
     Args:
         points: landmarks, px; NaN where lost. Frames with a lost neighbour are never called jumps.
+        fps: frames per second.
     """
     found = torch.zeros(points.shape[0], dtype=torch.bool, device=points.device)
     if points.shape[0] < 3:
@@ -40,7 +42,8 @@ def jumps(points: Float[Tensor, "t l 2"]) -> Bool[Tensor, " t"]:
     size = torch.minimum(face_size(before), face_size(after))
     away = (here - (before + after) / 2).norm(dim=-1).mean(-1) / size
     apart = (after - before).norm(dim=-1).mean(-1) / size
-    leap = (away > JUMP_LEAST) & (away > JUMP_RATIO * apart)
+    least = JUMP_LEAST * max(1.0, JUMP_FPS / fps)
+    leap = (away > least) & (away > JUMP_RATIO * apart)
     # The frames beside a leap deviate too, by half as much: only the peak is the culprit.
     padded = torch.nn.functional.pad(away.nan_to_num(0.0), (1, 1))
     peak = (away > padded[:-2]) & (away >= padded[2:])
