@@ -6,19 +6,23 @@
 namespace tgb {
 namespace TGB_ISA {
 
-// Pixel centres of every block, and each block's first pixel, relative to the tile. A constant expression: code run
-// at load time must not use an instruction set the machine may lack.
+// Pixel centres of the blocks in each column and row of a tile, and each block's first pixel, relative to the tile.
+// Small on purpose: it lives in the L1 cache beside a tile's pixels. A constant expression: code run at load time must
+// not use an instruction set the machine may lack.
 struct BlockTable {
-  alignas(64) float x[kBlocks][kLanes], y[kBlocks][kLanes], left[kBlocks], top[kBlocks];
+  alignas(64) float x[kBlocksAcross][kLanes], y[kBlocksAcross][kLanes], left[kBlocks], top[kBlocks];
   constexpr BlockTable() : x{}, y{}, left{}, top{} {
     for (int b = 0; b < kBlocks; b++) {
       left[b] = static_cast<float>(b % kBlocksAcross * kBlock), top[b] = static_cast<float>(b / kBlocksAcross * kBlock);
-      for (int l = 0; l < kLanes; l++)
-        x[b][l] = left[b] + static_cast<float>(l % kBlock), y[b][l] = top[b] + static_cast<float>(l / kBlock);
     }
+    for (int i = 0; i < kBlocksAcross; i++)
+      for (int l = 0; l < kLanes; l++)
+        x[i][l] = static_cast<float>(i * kBlock + l % kBlock), y[i][l] = static_cast<float>(i * kBlock + l / kBlock);
   }
 };
 static constexpr BlockTable kBlockTable{};
+static inline const float* block_x(int block) { return kBlockTable.x[block % kBlocksAcross]; }
+static inline const float* block_y(int block) { return kBlockTable.y[block / kBlocksAcross]; }
 
 // One screen tile: its place in the image and its part inside it.
 struct TileView {
@@ -29,7 +33,7 @@ struct TileView {
   }
   bool whole() const { return width == kTile && height == kTile; }
   bool holds(int block, int lane) const {
-    return kBlockTable.x[block][lane] < width && kBlockTable.y[block][lane] < height;
+    return block_x(block)[lane] < width && block_y(block)[lane] < height;
   }
 };
 

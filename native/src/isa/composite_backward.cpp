@@ -56,7 +56,7 @@ template <bool Split>
 inline void accumulate(Pixels& pixels, const float* last, int block, const Splat& s, F mx, F my, F index,
                        const F& threshold, const F& alpha_max, Sums& sums) {
   for (int k = 0; k < kLanes; k += kWidth) {
-    const F dx = load(kBlockTable.x[block] + k) - mx, dy = load(kBlockTable.y[block] + k) - my;
+    const F dx = load(block_x(block) + k) - mx, dy = load(block_y(block) + k) - my;
     const F u = fma(F(s.ux), dx, F(s.uy) * dy), v = F(s.vy) * dy, exponent = fnma(v, v, fnma(u, u, F(s.lo)));
     const M counts = both(ge(exponent, threshold), ge(load(last + k), index));
     const F raw = keep(counts, exp2(exponent)), alpha = vmin(raw, alpha_max), rest = reciprocal(F(1.f) - alpha);

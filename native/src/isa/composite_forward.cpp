@@ -6,7 +6,9 @@ namespace tgb {
 namespace TGB_ISA {
 namespace {
 
-constexpr int kBatch = 64;  // splats per round: their block masks transpose into one 64-bit hit list per block
+// Splats per round. Their block masks are transposed into kWords 64-bit hit lists per block, so that a block's pixels
+// stay in registers for as long as possible.
+constexpr int kWords = 4, kBatch = 64 * kWords;
 
 // Running state of a tile's pixels, block-major. A pixel that stops moves its transmittance from T to `stopped` and
 // goes on with T = 0, so stopping needs no branch; a block is dropped once all its T are 0.
@@ -34,33 +36,40 @@ inline uint64_t clear(Pixels& pixels, const TileView& view, float* last) {
   return alive;
 }
 
-// Composites the splats in `hits` over one block; returns whether any of its pixels goes on.
-inline bool composite_block(Pixels& pixels, float* last, int block, uint64_t hits, const Splat* splats,
-                            const Limits& limits) {
-  bool alive = false;
+struct Batch {
+  alignas(64) Splat splats[kBatch];   // means relative to the tile
+  uint64_t rows[kBatch];              // blocks each splat touches
+  uint64_t hits[kWords][kBlocks];     // splats that touch each block
+  uint64_t alive[kWords];             // blocks that went on after each word
+};
+
+// Composites the splats in `batch` over one block; sets its bit in `batch.alive` for as long as a pixel goes on.
+inline void composite_block(Pixels& pixels, float* last, int block, int words, Batch& batch, const Limits& limits) {
   for (int k = 0; k < kLanes; k += kWidth) {
-    const F x = load(kBlockTable.x[block] + k), y = load(kBlockTable.y[block] + k);
+    const F x = load(block_x(block) + k), y = load(block_y(block) + k);
     F T = load(pixels.T[block] + k), stopped = load(pixels.stopped[block] + k), latest = load(last + k);
     F r = load(pixels.r[block] + k), g = load(pixels.g[block] + k), b = load(pixels.b[block] + k);
-    for (uint64_t rest = hits; rest != 0; rest &= rest - 1) {
-      const Splat& s = splats[__builtin_ctzll(rest)];
-      const F dx = x - F(s.mx), dy = y - F(s.my), u = fma(F(s.ux), dx, F(s.uy) * dy), v = F(s.vy) * dy;
-      const F exponent = fnma(v, v, fnma(u, u, F(s.lo)));
-      const M reached = ge(exponent, limits.threshold);
-      const F alpha = keep(reached, vmin(exp2(exponent), limits.alpha_max));
-      const F next = fnma(alpha, T, T);
-      const M go = ge(next, limits.transmittance_min);
-      latest = select(both(reached, go), F(s.place), latest);
-      const F weight = keep(go, alpha * T);
-      stopped = select(go, stopped, vmax(stopped, T));  // T is 0 once stopped
-      T = keep(go, next);
-      r = fma(weight, F(s.r), r), g = fma(weight, F(s.g), g), b = fma(weight, F(s.b), b);
+    for (int w = 0; w < words; w++) {
+      for (uint64_t rest = batch.hits[w][block]; rest != 0; rest &= rest - 1) {
+        const Splat& s = batch.splats[64 * w + __builtin_ctzll(rest)];
+        const F dx = x - F(s.mx), dy = y - F(s.my), u = fma(F(s.ux), dx, F(s.uy) * dy), v = F(s.vy) * dy;
+        const F exponent = fnma(v, v, fnma(u, u, F(s.lo)));
+        const M reached = ge(exponent, limits.threshold);
+        const F alpha = keep(reached, vmin(exp2(exponent), limits.alpha_max));
+        const F next = fnma(alpha, T, T);
+        const M go = ge(next, limits.transmittance_min);
+        latest = select(both(reached, go), F(s.place), latest);
+        const F weight = keep(go, alpha * T);
+        stopped = select(go, stopped, vmax(stopped, T));  // T is 0 once stopped
+        T = keep(go, next);
+        r = fma(weight, F(s.r), r), g = fma(weight, F(s.g), g), b = fma(weight, F(s.b), b);
+      }
+      if (!any(gt(T, F(0.f)))) break;
+      batch.alive[w] |= 1ull << block;
     }
     store(pixels.T[block] + k, T), store(pixels.stopped[block] + k, stopped), store(last + k, latest);
     store(pixels.r[block] + k, r), store(pixels.g[block] + k, g), store(pixels.b[block] + k, b);
-    alive |= any(gt(T, F(0.f)));
   }
-  return alive;
 }
 
 // Puts the background behind the pixels and writes them to the image rows.
@@ -89,35 +98,45 @@ void write_tile(Pixels& pixels, const Scene& scene, const TileView& view, float*
   }
 }
 
+// Fills the batch with the `count` list entries from `at` on: tile-relative splats, block masks, hit lists.
+inline void load_batch(Batch& batch, const Frame& frame, const TileView& view, uint32_t begin, uint32_t at, int count,
+                       float threshold, uint64_t alive) {
+  const uint64_t* list = frame.list.data() + at;
+  for (int j = 0; j < count; j++) {
+    if (j + 8 < count) __builtin_prefetch(&frame.sorted[static_cast<uint32_t>(list[j + 8])]);
+    Splat& s = batch.splats[j] = frame.sorted[static_cast<uint32_t>(list[j])];
+    const uint64_t inside = rectangle_mask(s, view.left, view.top);
+    s.mx -= static_cast<float>(view.left), s.my -= static_cast<float>(view.top);
+    s.place = static_cast<float>(at + j - begin);
+    batch.rows[j] = ellipse_mask(s, threshold, inside & alive);
+  }
+  for (int w = 0; 64 * w < count; w++) {
+    for (int j = imax(count, 64 * w); j < 64 * (w + 1); j++) batch.rows[j] = 0;
+    transpose_bits(batch.rows + 64 * w, batch.hits[w]);
+    batch.alive[w] = 0;
+  }
+}
+
 void composite_tile(Frame& frame, const Scene& scene, int tile, float* color, float* alpha) {
   const TileView view(frame, scene, tile);
   const float threshold = log2f(scene.constants.alpha_min);
   const Limits limits{F(threshold), F(scene.constants.alpha_max), F(scene.constants.transmittance_min)};
   Pixels pixels;
+  Batch batch;
   float* last = frame.last.data() + static_cast<size_t>(tile) * kBlocks * kLanes;
   uint64_t alive = clear(pixels, view, last);
   const uint32_t begin = frame.tile_begin[tile], end = frame.tile_begin[tile + 1];
   uint32_t at = begin;
-  alignas(64) Splat splats[kBatch];
-  uint64_t rows[kBatch], hits[kBlocks];
   while (at < end && alive != 0) {
-    const int count = end - at < kBatch ? static_cast<int>(end - at) : kBatch;
-    for (int j = 0; j < count; j++) {
-      if (at + j + 8 < end) __builtin_prefetch(&frame.sorted[static_cast<uint32_t>(frame.list[at + j + 8])]);
-      Splat& s = splats[j] = frame.sorted[static_cast<uint32_t>(frame.list[at + j])];
-      const uint64_t inside = rectangle_mask(s, view.left, view.top);
-      s.mx -= static_cast<float>(view.left), s.my -= static_cast<float>(view.top);
-      s.place = static_cast<float>(at + j - begin);
-      frame.masks[at + j] = rows[j] = ellipse_mask(s, threshold, inside & alive);
-    }
-    for (int j = count; j < kBatch; j++) rows[j] = 0;
-    transpose_bits(rows, hits);
-    uint64_t still = 0;
+    const int count = end - at < kBatch ? static_cast<int>(end - at) : kBatch, words = (count + 63) / 64;
+    load_batch(batch, frame, view, begin, at, count, threshold, alive);
     for (uint64_t rest = alive; rest != 0; rest &= rest - 1) {
       const int b = __builtin_ctzll(rest);
-      if (composite_block(pixels, last + b * kLanes, b, hits[b], splats, limits)) still |= 1ull << b;
+      composite_block(pixels, last + b * kLanes, b, words, batch, limits);
     }
-    alive = still;
+    for (int j = 0; j < count; j++)  // for the backward pass: without blocks that stopped in an earlier word
+      frame.masks[at + j] = batch.rows[j] & (j < 64 ? alive : batch.alive[j / 64 - 1]);
+    alive = batch.alive[words - 1];
     at += static_cast<uint32_t>(count);
   }
   frame.tile_used[tile] = at - begin;
