@@ -128,7 +128,11 @@ def _presence(valid: Bool[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
     lost = np.flatnonzero(~valid)
     if len(lost) == 0:
         return np.ones(len(valid), np.float32)
-    distance = np.abs(np.arange(len(valid))[:, None] - lost[None]).min(1)
+    frames = np.arange(len(valid))
+    place = np.searchsorted(lost, frames)
+    after = np.abs(lost[np.minimum(place, len(lost) - 1)] - frames)
+    before = np.abs(frames - lost[np.maximum(place - 1, 0)])
+    distance = np.minimum(before, after)
     share = np.minimum(distance / FADE_FRAMES, 1.0)
     return (share * share * (3.0 - 2.0 * share)).astype(np.float32)
 

@@ -40,6 +40,12 @@ def to_bytes(rgb: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     return np.clip(np.rint(rgb * 255.0), 0, 255).astype(np.uint8)
 
 
+def working_size(shape: tuple[int, ...], unit: float, face_px: float) -> tuple[float, tuple[int, int]]:
+    """Scale at which a face ``unit`` px wide is at most ``face_px`` wide, and the (width, height) then."""
+    scale = min(1.0, face_px / unit)
+    return scale, (max(1, round(shape[1] * scale)), max(1, round(shape[0] * scale)))
+
+
 def resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
     """The picture at another size: area-averaged when it shrinks, cubic when it grows."""
     if image.shape[1] == width and image.shape[0] == height:

@@ -72,8 +72,7 @@ class Ink:
         self, frame: Frame, points: Points, presence: float, matte: Plane | None, state: dict[str, Any]
     ) -> Frame:
         height, width = frame.shape[:2]
-        scale = min(1.0, WORK_FACE_PX / state["unit"])
-        size = (max(1, round(width * scale)), max(1, round(height * scale)))
+        scale, size = filters.working_size(frame.shape, state["unit"], WORK_FACE_PX)
         lab = filters.to_lab(filters.resize(frame, *size))
         fields = _tone_and_lines(lab, points * scale, presence, state["unit"] * scale)
         fields = filters.resize(fields, width, height)

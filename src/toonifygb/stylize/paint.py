@@ -65,9 +65,8 @@ class Paint:
 
     def _paint(self, frame: Frame, points: Points, presence: float, state: dict[str, Any]) -> Frame:
         height, width = frame.shape[:2]
-        scale = min(1.0, WORK_FACE_PX / state["unit"])
+        scale, size = filters.working_size(frame.shape, state["unit"], WORK_FACE_PX)
         unit = state["unit"] * scale
-        size = (max(1, round(width * scale)), max(1, round(height * scale)))
         lab = filters.to_lab(filters.resize(frame, *size))
         tangents, clarity = filters.structure(lab, 0.025 * unit, STROKE_REST)
         dabs = filters.kuwahara(lab, tangents, clarity, 0.045 * unit)

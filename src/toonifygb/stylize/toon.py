@@ -78,8 +78,7 @@ class Toon:
 
     def _draw(self, frame: Frame, points: Points, presence: float, state: dict[str, Any]) -> Frame:
         height, width = frame.shape[:2]
-        scale = min(1.0, WORK_FACE_PX / state["unit"])
-        size = (max(1, round(width * scale)), max(1, round(height * scale)))
+        scale, size = filters.working_size(frame.shape, state["unit"], WORK_FACE_PX)
         lab = filters.to_lab(filters.resize(frame, *size))
         fields = _simplified(lab, points * scale, presence, state, state["unit"] * scale)
         fields = filters.resize(fields, width, height)
