@@ -11,7 +11,6 @@ import torch
 
 from toonifygb import synthetic
 from toonifygb.errors import InputError
-from toonifygb.geometry.cameras import project
 from toonifygb.head import PARTS
 from toonifygb.render.mesh import rasterize_mesh
 from toonifygb.synthetic import motion as motions
@@ -51,7 +50,9 @@ def test_frames_differ_in_time_and_between_subjects(clip: SyntheticClip) -> None
 
 def test_shapes_types_and_ranges(clip: SyntheticClip) -> None:
     assert len(clip) == clip.sequence.n_frames == 60
-    frame = next(iter(clip))
+    frame = clip[0]
+    in_order = [digest(drawn) for drawn, _ in zip(clip, range(3), strict=False)]
+    assert in_order == [digest(clip[index]) for index in range(3)]
     assert np.array_equal(frame.image, next(clip.frames))
     assert frame.image.shape == (SIZE, SIZE, 3)
     assert frame.image.dtype == np.uint8
@@ -79,10 +80,7 @@ def test_the_matte_covers_the_head_mesh_of_the_true_parameters(clip: SyntheticCl
         matte = clip[index].head
         assert face.sum() > 300
         assert matte[face].mean() > 0.995
-    outside = clip[0].person < 0.01
-    _pixels, depth = project(sequence.camera, vertices)
-    assert (depth > 0).all()
-    assert outside.mean() > 0.3
+        assert (clip[index].person < 0.01).mean() > 0.25  # and not everything
 
 
 def test_true_landmarks_sit_on_what_is_drawn(clip: SyntheticClip) -> None:

@@ -33,12 +33,8 @@ class Pose:
     vertices: Float32[np.ndarray, "v 3"]
     """World, m."""
     normals: Float32[np.ndarray, "v 3"]
-    root: Float32[np.ndarray, "4 4"]
-    """Rest → world of what hangs on the root: shoulders and clothes."""
-    skull: Float32[np.ndarray, "4 4"]
-    """Rest → world of what hangs on the skull: hair."""
-    eyes: Float32[np.ndarray, "2 4 4"]
-    """Rest → world of the left and right eyeball."""
+    joints: Float32[np.ndarray, "5 4 4"]
+    """Rest → world of what hangs on each joint: clothes on the root, hair on the neck, which carries the skull."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +61,7 @@ class Body:
         torso = torch.from_numpy(self.rest[n_head:]) @ transforms[0, :3, :3].T + transforms[0, :3, 3]
         posed = torch.cat([vertices, torso])
         normals = meshes.vertex_normals(posed, torch.from_numpy(self.faces))
-        placed = transforms.numpy()
-        return Pose(posed.numpy(), normals.numpy(), placed[0], placed[1], placed[3:5])
+        return Pose(posed.numpy(), normals.numpy(), transforms.numpy())
 
     def region(self, name: str) -> Float32[np.ndarray, " v"]:
         """A region mask of the head model, 0 on the shoulders."""

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import os
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -23,6 +26,8 @@ if TYPE_CHECKING:
     from toonifygb.structures import HeadMotion
     from toonifygb.synthetic.subject import Subject
 
+WORKERS = min(4, os.cpu_count() or 1)
+"""Frames drawn at the same time while a clip is read in order."""
 FOCAL_HEIGHTS = 1.8
 """Focal length in image heights: a portrait lens."""
 
@@ -52,7 +57,15 @@ class SyntheticClip:
         return (frame.image for frame in self)
 
     def __iter__(self) -> Iterator[SyntheticFrame]:
-        return (self[index] for index in range(len(self)))
+        """All frames in order; a few are drawn ahead, each on a thread of its own."""
+        with ThreadPoolExecutor(WORKERS) as pool:
+            ahead: deque[Future[SyntheticFrame]] = deque()
+            for index in range(len(self)):
+                ahead.append(pool.submit(self.__getitem__, index))
+                if len(ahead) > WORKERS:
+                    yield ahead.popleft().result()
+            while ahead:
+                yield ahead.popleft().result()
 
 
 def render_clip(

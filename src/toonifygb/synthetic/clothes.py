@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from toonifygb.head import PARTS
+from toonifygb.head import JOINTS, PARTS
 from toonifygb.synthetic.body import CHEST_Z, TORSO, neck_loop
 from toonifygb.synthetic.look import linear
 from toonifygb.synthetic.noise import fractal_noise, smoothstep, value_noise
@@ -75,6 +75,7 @@ def dress(materials: Materials, body: Body, look: Look, seed: int) -> Float32[np
         values[:] = values * (1 - cloth) + level * cloth
     folds = fractal_noise(place * (1.0, 0.45, 1.0) + 0.4 * place[:, 1:2], 22, seed + 63)
     hang = smoothstep(0.0, 0.10, below)
+    materials.carrier[cloth > 0.5] = JOINTS.index("root")
     materials.raise_m += THICKNESS_M * cloth + 0.0042 * folds * hang
     return cloth
 

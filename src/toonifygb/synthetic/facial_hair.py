@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from toonifygb.geometry.sampling import sample_surface
-from toonifygb.head import PARTS
+from toonifygb.head import JOINTS, PARTS
 from toonifygb.synthetic.look import linear
 from toonifygb.synthetic.noise import smoothstep
 from toonifygb.synthetic.refine import unit
@@ -47,7 +47,8 @@ class FacialHair:
         """The hairs on a posed subject, world."""
         roots = np.einsum("sj,sjc->sc", self.weights, pose.vertices[self.vertices])
         side, up, normal = _frames(
-            np.einsum("sj,sjc->sc", self.weights, pose.normals[self.vertices]), pose.skull[:3, 0]
+            np.einsum("sj,sjc->sc", self.weights, pose.normals[self.vertices]),
+            pose.joints[JOINTS.index("neck"), :3, 0],
         )
         points = roots[:, None] + sum(
             self.local[..., axis : axis + 1] * direction[:, None]

@@ -218,9 +218,10 @@ def grow_hair(body: Body, look: Look, seed: int) -> Strands:
         points.append(ahead)
         outward.append(near)
     path = np.stack(points, 1)
+    clear = ~_kinked(path)
     if style.curl_m:
         path = _curled(path, style, rng)
-    clear = ~_on_the_face(path).any(1)
+    clear &= ~_on_the_face(path).any(1)
     return _finish(path[clear], np.stack(outward, 1)[clear], layer[clear], look, style, rng)
 
 
@@ -258,10 +259,16 @@ def _along_skin(direction: Points, normals: Points) -> Points:
 
 def _beside_the_face(points: Points) -> Points:
     """Points moved sideways out of the way of forehead, eyes and cheeks."""
-    least = np.interp(points[:, 1], (-0.05, 0.06, 0.08, 0.095, 0.104), (0.066, 0.066, 0.055, 0.030, 0.0))
+    least = np.interp(points[:, 1], (-0.05, 0.06, 0.08, 0.095, 0.104), (0.060, 0.060, 0.050, 0.028, 0.0))
     aside = np.where(points[:, 0] < 0, -1, 1) * np.maximum(np.abs(points[:, 0]), least)
     x = np.where(points[:, 2] > 0.03, aside, points[:, 0])
     return np.concatenate([x[:, None], points[:, 1:]], 1).astype(np.float32)
+
+
+def _kinked(path: Float32[np.ndarray, "s k 3"]) -> np.ndarray:
+    """Strands that were pushed around a sharp corner (more than 50°)."""
+    along = unit(np.diff(path, axis=1))
+    return (np.einsum("ski,ski->sk", along[:, 1:], along[:, :-1]) < 0.64).any(1)
 
 
 def _on_the_face(points: Float32[np.ndarray, "s k 3"]) -> np.ndarray:

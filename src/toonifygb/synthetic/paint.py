@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from toonifygb.head import PARTS
+from toonifygb.head import JOINTS, PARTS
 from toonifygb.synthetic.body import TORSO
 from toonifygb.synthetic.look import linear
 from toonifygb.synthetic.noise import fractal_noise, smoothstep, value_noise
 
 if TYPE_CHECKING:
-    from jaxtyping import Float32
+    from jaxtyping import Float32, Int64
 
     from toonifygb.synthetic.body import Body
     from toonifygb.synthetic.look import Look
@@ -44,7 +44,9 @@ class Materials:
     raise_m: Float32[np.ndarray, " n"]
     """Displacement along the normal, m: cloth and the body of the hair."""
     bump: Float32[np.ndarray, "n 3"]
-    """Added to the normal, rest axes: what the displacement and small relief do to it."""
+    """Added to the normal, rest axes: what the displacement and the cornea do to it."""
+    carrier: Int64[np.ndarray, " n"]
+    """Joint whose rotation carries the bump."""
 
     def optics(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """The arguments of ``light.shade``: albedo, shine, gloss, softness."""
@@ -58,15 +60,24 @@ def paint(body: Body, look: Look, seed: int) -> Materials:
     n = len(place)
     zeros = np.zeros(n, np.float32)
     materials = Materials(
-        np.zeros((n, 3), np.float32), zeros + 1, zeros + 14, zeros + 1, zeros.copy(), np.zeros((n, 3), np.float32)
+        albedo=np.zeros((n, 3), np.float32),
+        shine=zeros + 1,
+        gloss=zeros + 14,
+        softness=zeros + 1,
+        raise_m=zeros.copy(),
+        bump=np.zeros((n, 3), np.float32),
+        carrier=np.full(n, JOINTS.index("neck")),
     )
     _paint_skin(materials, body, look, place, part == PARTS.index("skin"), seed)
     _paint_mouth(materials, place, part)
     for joint, name in ((3, "eye_left"), (4, "eye_right")):
         rows = np.flatnonzero(part == PARTS.index(name))
         centre = body.head.rest_joints[joint].numpy()
-        materials.albedo[rows] = eye_color(place[rows] - centre, look, seed)
-        materials.shine[rows], materials.gloss[rows], materials.softness[rows] = 2.0, 500.0, 0.5
+        from_centre = place[rows] - centre
+        materials.albedo[rows] = eye_color(from_centre, look, seed)
+        materials.bump[rows] = _cornea(from_centre)
+        materials.carrier[rows] = joint
+        materials.shine[rows], materials.gloss[rows], materials.softness[rows] = 4.0, 130.0, 0.5
     return materials
 
 
@@ -154,6 +165,14 @@ def _paint_mouth(materials: Materials, place: Points, part: np.ndarray) -> None:
         materials.shine[rows], materials.gloss[rows] = shine, gloss
 
 
+def _cornea(from_centre: Points) -> Points:
+    """What the cornea, which bulges twice as strongly as the eyeball, adds to its normals: the eyes' sparkle."""
+    direction = from_centre / np.linalg.norm(from_centre, axis=1, keepdims=True)
+    angle = np.arccos(np.clip(direction[:, 2], -1, 1))
+    bulge = 1.1 * smoothstep(1.25 * IRIS, 0.9 * IRIS, angle)
+    return (direction - np.array((0, 0, 1), np.float32)) * bulge[:, None]
+
+
 def eye_color(from_centre: Points, look: Look, seed: int) -> Points:
     """White, iris and pupil of an eyeball that looks along +z."""
     direction = from_centre / np.linalg.norm(from_centre, axis=1, keepdims=True)
@@ -168,10 +187,13 @@ def eye_color(from_centre: Points, look: Look, seed: int) -> Points:
     iris *= 1 - 0.75 * smoothstep(0.74, 1.0, radius)[:, None]
     veins = smoothstep(0.35, 0.7, fractal_noise(direction * (1, 1, 0.4), 12, seed + 52))
     far = smoothstep(1.4, 3.2, radius)
-    white = linear((232, 227, 222)) * (1 - far[:, None] * np.array((0.04, 0.16, 0.16)))
+    white = linear((218, 211, 206)) * (1 - far[:, None] * np.array((0.04, 0.16, 0.16)))
     white = white * (1 - (0.25 * veins * far)[:, None] * np.array((0.1, 0.8, 0.8)))
     edge = smoothstep(0.94, 1.08, radius)[:, None]
     color = iris * (1 - edge) + white * edge
+    color *= (
+        1 - 0.42 * smoothstep(0.06, 0.36, direction[:, 1])[:, None]
+    )  # the upper lid and its lashes shade the eye
     return color * smoothstep(PUPIL / IRIS - 0.06, PUPIL / IRIS + 0.04, radius)[:, None] + 0.004
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from toonifygb.head import JOINTS, PARTS
 from toonifygb.render.mesh import interpolated_means, rasterize_mesh, supersampled
 from toonifygb.synthetic import light
 from toonifygb.synthetic.refine import unit
@@ -20,10 +21,13 @@ if TYPE_CHECKING:
     from toonifygb.synthetic.subject import Subject
 
 SUPERSAMPLE = 2
+EYE_KEY_SEEN = 0.6
+"""Share of the key lamp on the eyes: the shadow map is too coarse for the lids, whose shade is painted instead."""
 HAIR_LIT_PER_POINT = 3
 """Every so many points of a hair ask for their own shadow."""
+SKULL = JOINTS.index("neck")
 HIDDEN_COSINE = -0.3
-"""Vertices turned away from the camera by more than this (cosine) are not lit, faces of such vertices not drawn."""
+"""Vertices turned away from the camera by more than this are not lit; their faces and hairs are not drawn."""
 
 
 @dataclass(frozen=True)
@@ -86,10 +90,10 @@ def _skin(subject: Subject, pose: Pose, shadows: light.ShadowMap) -> _Layer:
     turned_away = np.einsum("ni,ni->n", normals, views) < HIDDEN_COSINE
     faces = refinement.faces[~turned_away[refinement.faces].all(1)]
     seen = np.flatnonzero(~turned_away)
-    bump = materials.bump[seen]
-    on_root = subject.cloth[seen, None] > 0.5
-    bump = np.where(on_root, bump @ pose.root[:3, :3].T, bump @ pose.skull[:3, :3].T)
+    bump = np.einsum("nij,nj->ni", pose.joints[materials.carrier[seen], :3, :3], materials.bump[seen])
     key_seen = shadows.visibility(pose.vertices, pose.normals)
+    is_eye = np.isin(subject.body.part, [PARTS.index("eye_left"), PARTS.index("eye_right")])
+    key_seen = np.where(is_eye, EYE_KEY_SEEN, key_seen)
     sky, key = refinement.spread(np.stack([subject.open_sky, key_seen], 1))[seen].T
     surface = light.Surface(unit(normals[seen] + bump), views[seen], sky, key)
     lit = light.shade(surface, *(values[seen] for values in materials.optics()))
@@ -101,7 +105,8 @@ def _skin(subject: Subject, pose: Pose, shadows: light.ShadowMap) -> _Layer:
 def _hairs(subject: Subject, pose: Pose, shadows: light.ShadowMap) -> list[_Layer]:
     """Strands of the head's hair, and brows and lashes."""
     layers = []
-    for strands in (subject.hair.moved(pose.skull), subject.facial_hair.place(pose)):
+    head_hair = subject.hair.moved(pose.joints[SKULL]).facing(HIDDEN_COSINE)
+    for strands in (head_hair, subject.facial_hair.place(pose)):
         n_strands, n_points = strands.width.shape
         asked = np.arange(0, n_points + HAIR_LIT_PER_POINT - 1, HAIR_LIT_PER_POINT).clip(max=n_points - 1)
         points, outward = (values[:, asked].reshape(-1, 3) for values in (strands.points, strands.outward))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,6 +33,12 @@ class Strands:
         """The same hairs under a rigid motion."""
         turn, shift = transform[:3, :3].T, transform[:3, 3]
         return Strands(self.points @ turn + shift, self.outward @ turn, self.width, self.albedo, self.exposure)
+
+    def facing(self, least_cosine: float) -> Strands:
+        """Those hairs with a point whose outward normal is turned to a camera at the origin by at least this."""
+        cosine = -np.einsum("ski,ski->sk", self.outward, unit(self.points))
+        kept = (cosine > least_cosine).any(1)
+        return Strands(*(getattr(self, field.name)[kept] for field in fields(self)))
 
     def ribbons(self) -> tuple[Float32[np.ndarray, "n 3"], Int64[np.ndarray, "f 3"]]:
         """Mesh for a camera at the origin: two vertices for each point."""

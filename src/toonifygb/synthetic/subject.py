@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 OPEN_JAW_RAD = 0.32
 """Opening at which the light inside the mouth is measured."""
+MOUTH_GLOW = 0.22
+"""Least light inside the mouth: what its wet walls pass on to each other."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ def make_subject(seed: int) -> Subject:
     facial_hair.tint_brows(materials, body, look)
     hair.cover_scalp(materials, body, look, seed)
     cloth = clothes.dress(materials, body, look, seed)
-    materials.bump[:] = _relief(body, materials)
+    materials.bump += _relief(body, materials)
     return Subject(
         seed,
         look,
@@ -106,4 +108,4 @@ def _open_sky(body: Body) -> Float32[np.ndarray, " v"]:
         body.part, [heads.PARTS.index(name) for name in heads.PARTS if "eye" not in name and name != "skin"]
     )
     inside = np.maximum(np.maximum(body.region("inside_mouth"), body.region("lips")), mouth_part)
-    return at_rest * (1 - inside) + np.maximum(at_open, at_rest) * inside
+    return at_rest * (1 - inside) + np.maximum(np.maximum(at_open, at_rest), MOUTH_GLOW) * inside
