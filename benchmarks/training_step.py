@@ -8,6 +8,7 @@ from benchmarks import limits, scenes
 from benchmarks.harness import Figure, cpu_seconds
 from toonifygb import render
 from toonifygb.render.fused import ReferenceKernels
+from toonifygb.structures import GaussianParams
 
 K, WIDTHS = 20, (3, 4, 3, 1, 12)
 ADAM_BYTES, BLEND_BYTES = 24, 4
@@ -25,6 +26,8 @@ def run() -> list[Figure]:
     base, gradient, psi = torch.rand(p), torch.randn(p), torch.rand(K)
     moments, rates = (torch.rand(p), torch.rand(p)), torch.full((p,), 1e-4)
     image, target = torch.rand(2, 256, 256, 3)
+    raw = GaussianParams(splats.means, splats.quats, splats.scales.log(), splats.opacities.logit(), splats.sh)
+    weights, transforms = torch.softmax(torch.randn(n, 5), -1), torch.eye(4).repeat(5, 1, 1)
     leaves = splats.map(lambda tensor: tensor.clone().requires_grad_())
     inputs = [leaves.means, leaves.quats, leaves.scales, leaves.opacities, leaves.sh]
     parameter = torch.nn.Parameter(deltas.clone())
@@ -41,6 +44,11 @@ def run() -> list[Figure]:
     jobs = {
         "blend": (lambda: native.blend(base, deltas, psi, out=base), lambda: torch.addmv(base, deltas.T, psi)),
         "render forward + backward": (rendering, None),
+        "skin": (lambda: native.skin(raw, weights, transforms), lambda: plain.skin(raw, weights, transforms)),
+        "skin gradient": (
+            lambda: native.skin_gradient(raw, weights, transforms, splats),
+            lambda: plain.skin_gradient(raw, weights, transforms, splats),
+        ),
         "L1 + D-SSIM, value and gradient": (
             lambda: native.l1_dssim(image, target),
             lambda: plain.l1_dssim(image, target),

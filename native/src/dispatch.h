@@ -18,6 +18,8 @@ struct Kernels {
   void (*blend_adam)(const BlendState& state, const AdamRates& adam_rates, int threads);
   double (*l1_dssim)(const float* image, const float* target, int height, int width, float l1_weight,
                      float dssim_weight, float* gradient, SimilarityWork& work, int threads);
+  void (*skin)(const Skin& input, const SkinOutput& output, int threads);
+  void (*skin_backward)(const Skin& input, const SkinOutput& upstream, const SkinGradient& gradient, int threads);
   double (*measure_flops)();
 };
 

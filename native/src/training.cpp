@@ -21,6 +21,15 @@ TGB_API void tgb_blend_adam(const tgb::BlendState* state, const tgb::AdamRates* 
   tgb::kernels().blend_adam(*state, *adam_rates, threads);
 }
 
+TGB_API void tgb_skin(const tgb::Skin* input, const tgb::SkinOutput* output, int32_t threads) {
+  tgb::kernels().skin(*input, *output, threads);
+}
+
+TGB_API void tgb_skin_backward(const tgb::Skin* input, const tgb::SkinOutput* upstream,
+                               const tgb::SkinGradient* gradient, int32_t threads) {
+  tgb::kernels().skin_backward(*input, *upstream, *gradient, threads);
+}
+
 // Returns the loss, or NaN when out of memory.
 TGB_API double tgb_l1_dssim(const float* image, const float* target, int32_t height, int32_t width, float l1_weight,
                             float dssim_weight, float* gradient, int32_t threads) {

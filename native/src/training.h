@@ -23,6 +23,21 @@ struct BlendState {
   int32_t k, n, groups, skip_inactive;
 };
 
+constexpr int kJoints = 5;
+
+// Raw Gaussians and their binding to the joints.
+struct Skin {
+  const float *means, *quats, *log_scales, *opacity_logits;
+  const float *weights, *transforms;  // [n, kJoints]; [kJoints, 4, 4], rest to pose
+  int32_t n;
+};
+struct SkinOutput {  // splats, or d loss / d splats (then sh_frames is not used)
+  float *means, *quats, *scales, *opacities, *sh_frames;
+};
+struct SkinGradient {
+  float *means, *quats, *log_scales, *opacity_logits;
+};
+
 // Kept between calls.
 struct SimilarityWork {
   Buffer<float> derivatives, bands;

@@ -7,7 +7,9 @@ import torch
 from torch import Tensor
 
 from toonifygb import metrics, render
+from toonifygb.geometry import rotations
 from toonifygb.render.fused import Kernels, ReferenceKernels, expand_scale, learning_rates
+from toonifygb.structures import GaussianParams
 
 WIDTHS, N, K = (3, 4, 3, 1, 12), 1003, 7  # 1003: neither vectors nor chunks come out even
 P = N * sum(WIDTHS)
@@ -130,6 +132,43 @@ def test_inactive_rows_coast_unless_skipped(kernels: Kernels, rates: Tensor) -> 
     assert moved[True] == 0 < moved[False]
 
 
+def skinned(n: int) -> tuple[GaussianParams, Tensor, Tensor]:
+    """Raw Gaussians, weights (some rigid) and five joint maps that turn by up to two radians; float64."""
+    raw = GaussianParams(
+        torch.randn(n, 3).double(),
+        torch.randn(n, 4).double(),
+        torch.randn(n, 3).double() - 6,
+        2 * torch.randn(n).double(),
+        torch.randn(n, 4, 3).double(),
+    )
+    weights = torch.softmax(2 * torch.randn(n, 5), -1).double()
+    weights[::3] = torch.eye(5, dtype=torch.float64)[torch.arange(0, n, 3) % 5]
+    # the maps of one Gaussian differ by less than 90 degrees: a sum of opposite turns has no rotation factor
+    angles = torch.tensor([2.0, 0.3, 0.0]) + 0.3 * torch.randn(5, 3)
+    transforms = torch.eye(4, dtype=torch.float64).repeat(5, 1, 1)
+    transforms[:, :3, :3] = rotations.axis_angle_to_matrix(angles.double())
+    transforms[:, :3, 3] = torch.randn(5, 3).double()
+    return raw, weights, transforms
+
+
+def test_native_skinning_agrees(native_kernels: Kernels) -> None:
+    for n in (0, 1, 1003):
+        raw, weights, transforms = skinned(n)
+        expected = DEFINITION.skin(raw, weights, transforms)
+        narrow = (raw.to(torch.float32), weights.float(), transforms.float())
+        found = native_kernels.skin(*narrow)
+        upstream = expected.map(torch.randn_like)
+        expected_gradient = DEFINITION.skin_gradient(raw, weights, transforms, upstream)
+        gradient = native_kernels.skin_gradient(*narrow, upstream.to(torch.float32))
+        for ours, definition in ((found, expected), (gradient, expected_gradient)):
+            for name, value in vars(definition).items():
+                mine = getattr(ours, name).double()
+                assert mine.shape == value.shape
+                # 1e-5: float32 through three polar steps and a division by the quaternion's length
+                worst = ((mine - value).abs() / value.abs().clamp_min(1)).flatten().tolist()
+                assert max(worst, default=0) < 1e-5, name
+
+
 @pytest.mark.parametrize("size", [(1, 1), (5, 3), (11, 11), (33, 17), (64, 96)])
 def test_l1_dssim_agrees_with_its_definition(kernels: Kernels, size: tuple[int, int]) -> None:
     image, target = torch.rand(*size, 3), torch.rand(*size, 3)
@@ -156,7 +195,10 @@ def test_threads_do_not_change_a_bit(native_kernels: Kernels, rates: Tensor) -> 
             *state, psi, base, rates, 4, scale=torch.rand(K, N, generator=random), widths=WIDTHS
         )
         kernels.adam_step(*(row[0] for row in state), base, rates, 4)
-        results.append([blended, *state, *kernels.l1_dssim(image, target)])
+        torch.manual_seed(5)
+        raw, weights, transforms = skinned(3000)
+        splats = kernels.skin(raw.to(torch.float32), weights.float(), transforms.float())
+        results.append([blended, *state, *kernels.l1_dssim(image, target), splats.means, splats.quats])
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 

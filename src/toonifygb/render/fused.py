@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 
 from toonifygb import metrics
+from toonifygb.geometry import rotations, skinning
+from toonifygb.structures import GaussianParams, Splats
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -104,6 +106,34 @@ class Kernels(Protocol):
                 mean nothing.
             widths: floats per Gaussian of each parameter group in the flat vector, in order; needed with ``scale``.
             skip_inactive: leave rows with ψ_k = 0 as they are, moments included, instead of coasting on momentum.
+        """
+        ...
+
+    def skin(
+        self, raw: GaussianParams, weights: Float[Tensor, "n 5"], transforms: Float[Tensor, "5 4 4"]
+    ) -> Splats:
+        """Splats of raw Gaussians moved by linear blend skinning, without autograd.
+
+        The weighted sum of the joints' maps moves the centre as it is; orientation and harmonics (``sh_frames``)
+        are turned by its rotation factor, three Newton steps of the polar decomposition as in 3DGB.
+
+        Args:
+            raw: in the rest pose.
+            weights: of each Gaussian to the joints, rows sum to 1.
+            transforms: rest to pose.
+        """
+        ...
+
+    def skin_gradient(
+        self,
+        raw: GaussianParams,
+        weights: Float[Tensor, "n 5"],
+        transforms: Float[Tensor, "5 4 4"],
+        gradient: Splats,
+    ) -> GaussianParams:
+        """Gradient with respect to ``raw`` from the one with respect to the splats of ``skin``.
+
+        ``weights`` and ``transforms`` are constants; ``gradient.sh_frames`` is therefore not used.
         """
         ...
 
@@ -216,6 +246,40 @@ class ReferenceKernels:
             delta, first, second = deltas[k][live], first_moment[k][live], second_moment[k][live]
             self.adam_step(delta, first, second, psi[k] * gradient[live], rates[live], step, factor=factor)
             deltas[k, live], first_moment[k, live], second_moment[k, live] = delta, first, second
+
+    def skin(
+        self, raw: GaussianParams, weights: Float[Tensor, "n 5"], transforms: Float[Tensor, "5 4 4"]
+    ) -> Splats:
+        """See ``Kernels.skin``."""
+        maps = skinning.blend_transforms(weights, transforms)
+        linear, translation = maps[:, :3, :3], maps[:, :3, 3]
+        rotation = rotations.polar_factor(linear)
+        turn = rotations.matrix_to_quat(rotation)
+        return Splats(
+            means=torch.einsum("nij,nj->ni", linear, raw.means) + translation,
+            quats=rotations.quat_multiply(turn, rotations.quat_normalize(raw.quats)),
+            scales=raw.log_scales.exp(),
+            opacities=raw.opacity_logits.sigmoid(),
+            sh=raw.sh,
+            sh_frames=rotation,
+        )
+
+    def skin_gradient(
+        self,
+        raw: GaussianParams,
+        weights: Float[Tensor, "n 5"],
+        transforms: Float[Tensor, "5 4 4"],
+        gradient: Splats,
+    ) -> GaussianParams:
+        """See ``Kernels.skin_gradient``."""
+        with torch.enable_grad():
+            variables = raw.map(lambda tensor: tensor.detach().requires_grad_())
+            splats = self.skin(variables, weights, transforms)
+            inputs = [variables.means, variables.quats, variables.log_scales, variables.opacity_logits]
+            outputs = [splats.means, splats.quats, splats.scales, splats.opacities]
+            upstream = [gradient.means, gradient.quats, gradient.scales, gradient.opacities]
+            found = torch.autograd.grad(outputs, inputs, upstream)
+        return GaussianParams(*found, sh=gradient.sh)
 
     def l1_dssim(
         self,

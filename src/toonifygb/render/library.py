@@ -97,6 +97,27 @@ class BlendState(Structure):
     ]
 
 
+class Skin(Structure):
+    """Mirrors ``tgb::Skin``."""
+
+    _fields_ = [
+        *((name, c_void_p) for name in ("means", "quats", "log_scales", "opacity_logits", "weights", "transforms")),
+        ("n", c_int32),
+    ]
+
+
+class SkinOutput(Structure):
+    """Mirrors ``tgb::SkinOutput``."""
+
+    _fields_ = [(name, c_void_p) for name in ("means", "quats", "scales", "opacities", "sh_frames")]
+
+
+class SkinGradient(Structure):
+    """Mirrors ``tgb::SkinGradient``."""
+
+    _fields_ = [(name, c_void_p) for name in ("means", "quats", "log_scales", "opacity_logits")]
+
+
 _SIGNATURES = {
     "tgb_isa": (c_char_p, []),
     "tgb_set_isa": (c_int32, [c_char_p]),
@@ -108,6 +129,8 @@ _SIGNATURES = {
     "tgb_blend": (None, [c_void_p, c_void_p, c_int32, c_void_p, c_int32, c_int64, c_void_p, c_int32]),
     "tgb_adam": (None, [*[c_void_p] * 5, c_int64, POINTER(AdamRates), c_int32]),
     "tgb_blend_adam": (None, [POINTER(BlendState), POINTER(AdamRates), c_int32]),
+    "tgb_skin": (None, [POINTER(Skin), POINTER(SkinOutput), c_int32]),
+    "tgb_skin_backward": (None, [POINTER(Skin), POINTER(SkinOutput), POINTER(SkinGradient), c_int32]),
     "tgb_l1_dssim": (c_double, [c_void_p, c_void_p, c_int32, c_int32, c_float, c_float, c_void_p, c_int32]),
 }
 

@@ -10,6 +10,7 @@ import torch
 from toonifygb.render import library
 from toonifygb.render.fused import BETA1, BETA2, EPS, check_blend_step
 from toonifygb.render.native import available_threads
+from toonifygb.structures import GaussianParams, Splats
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,6 +34,31 @@ def _address(tensor: Tensor, name: str, shape: tuple[int, ...], dtype: torch.dty
 
 def _rates(step: int, factor: float) -> library.AdamRates:
     return library.AdamRates(beta1=BETA1, beta2=BETA2, eps=EPS, factor=factor, step=step)
+
+
+def _skin(raw: GaussianParams, weights: Tensor, transforms: Tensor) -> library.Skin:
+    n = raw.n
+    return library.Skin(
+        means=_address(raw.means, "raw.means", (n, 3)),
+        quats=_address(raw.quats, "raw.quats", (n, 4)),
+        log_scales=_address(raw.log_scales, "raw.log_scales", (n, 3)),
+        opacity_logits=_address(raw.opacity_logits, "raw.opacity_logits", (n,)),
+        weights=_address(weights, "weights", (n, 5)),
+        transforms=_address(transforms, "transforms", (5, 4, 4)),
+        n=n,
+    )
+
+
+def _skin_output(splats: Splats, n: int) -> library.SkinOutput:
+    """Addresses of splats, or of a gradient with respect to them."""
+    frames = splats.sh_frames
+    return library.SkinOutput(
+        means=_address(splats.means, "means", (n, 3)),
+        quats=_address(splats.quats, "quats", (n, 4)),
+        scales=_address(splats.scales, "scales", (n, 3)),
+        opacities=_address(splats.opacities, "opacities", (n,)),
+        sh_frames=None if frames is None else _address(frames, "sh_frames", (n, 3, 3)),
+    )
 
 
 class NativeKernels:
@@ -136,6 +162,46 @@ class NativeKernels:
             skip_inactive=skip_inactive,
         )
         self._engine.tgb_blend_adam(state, _rates(step, factor), self.threads)
+
+    def skin(
+        self, raw: GaussianParams, weights: Float[Tensor, "n 5"], transforms: Float[Tensor, "5 4 4"]
+    ) -> Splats:
+        """See ``Kernels.skin``."""
+        n = raw.n
+        splats = Splats(
+            means=torch.empty(n, 3),
+            quats=torch.empty(n, 4),
+            scales=torch.empty(n, 3),
+            opacities=torch.empty(n),
+            sh=raw.sh,
+            sh_frames=torch.empty(n, 3, 3),
+        )
+        self._engine.tgb_skin(_skin(raw, weights, transforms), _skin_output(splats, n), self.threads)
+        return splats
+
+    def skin_gradient(
+        self,
+        raw: GaussianParams,
+        weights: Float[Tensor, "n 5"],
+        transforms: Float[Tensor, "5 4 4"],
+        gradient: Splats,
+    ) -> GaussianParams:
+        """See ``Kernels.skin_gradient``."""
+        found = GaussianParams(
+            torch.empty_like(raw.means),
+            torch.empty_like(raw.quats),
+            torch.empty_like(raw.log_scales),
+            torch.empty_like(raw.opacity_logits),
+            sh=gradient.sh,
+        )
+        fields = (found.means, found.quats, found.log_scales, found.opacity_logits)
+        self._engine.tgb_skin_backward(
+            _skin(raw, weights, transforms),
+            _skin_output(gradient, raw.n),
+            library.SkinGradient(*(field.data_ptr() for field in fields)),
+            self.threads,
+        )
+        return found
 
     def l1_dssim(
         self,
