@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 N_VIEWS = 12
 _FACING = 0.2
 """Least cosine between a normal and the direction to the camera for a colour to be taken."""
+_POINTS_AT_ONCE = 256
 _SOLID = 0.9
 """Least matte value for a colour to be taken: edges are mixed with the background."""
 
@@ -56,7 +57,9 @@ class TrainingViews:
     def colors(
         self, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], skin_weights: Float[Tensor, "n 5"]
     ) -> Float[Tensor, "n 3"]:
-        """Mean colour where a point faces the camera, weighted by how squarely; grey where it never does."""
+        """Mean colour where a point faces the camera, weighted by how squarely; elsewhere that of the nearest such
+        point of this or, mirrored, the other side of the head; grey where no point faces any camera.
+        """
         total, weight = torch.zeros(len(points), 3), torch.zeros(len(points), 1)
         for view in self._views:
             pixels, visible = _pixels(view, points, skin_weights)
@@ -69,7 +72,21 @@ class TrainingViews:
             share = torch.where(visible & solid & (facing > _FACING), facing.square(), 0.0)[:, None]
             total += share * _sample(view.color, pixels)
             weight += share
-        return torch.where(weight > 0, total / weight.clamp_min(1e-6), 0.5)
+        seen = weight[:, 0] > 0
+        colors = torch.where(seen[:, None], total / weight.clamp_min(1e-6), 0.5)
+        if bool(seen.any()):
+            colors[~seen] = _nearest_colors(points[~seen], points[seen], colors[seen])
+        return colors
+
+
+def _nearest_colors(
+    points: Float[Tensor, "n 3"], known: Float[Tensor, "k 3"], colors: Float[Tensor, "k 3"]
+) -> Float[Tensor, "n 3"]:
+    """Colour of the nearest known point; the known ones count on both sides of the head's plane of symmetry."""
+    mirrored = known * known.new_tensor([-1.0, 1.0, 1.0])
+    both = torch.cat([known, mirrored])
+    nearest = [torch.cdist(part, both).argmin(1) for part in points.split(_POINTS_AT_ONCE)]
+    return colors.repeat(2, 1)[torch.cat(nearest)] if nearest else points
 
 
 def _look(dataset: Dataset, sequence: TrackedSequence, head: HeadModel, index: int) -> _View:
