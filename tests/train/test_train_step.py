@@ -9,16 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 import torch
-from make import TINY, tiny_avatar, tiny_head, tiny_motion, tiny_sequence
+from make import TINY, tiny_avatar, tiny_head, tiny_sequence
 
 from toonifygb import render
 from toonifygb.avatar import Avatar, MouthVolume
-from toonifygb.avatar.fields import FIELDS, each, join
-from toonifygb.avatar.skinner import Skinner, skinning_gradient
-from toonifygb.avatar.skinning import activate, blend_parameters, scale_deltas
+from toonifygb.avatar.fields import FIELDS, join
+from toonifygb.avatar.skinning import activate, scale_deltas
 from toonifygb.errors import InputError
 from toonifygb.progress import Stopped
-from toonifygb.structures import GaussianParams, Splats, TrackedSequence
+from toonifygb.structures import GaussianParams, TrackedSequence
 from toonifygb.train import Dataset, build_dataset, comparison, evaluate, first_avatar, train
 from toonifygb.train.densify import DensifyRules
 from toonifygb.train.losses import LossWeights, image_loss, mouth_loss
@@ -51,39 +50,6 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, TrackedSequ
 def same(a: Avatar, b: Avatar) -> bool:
     names = ("neutral", "deltas", "mouth_upper", "mouth_lower")
     return all(torch.equal(getattr(getattr(a, n), f), getattr(getattr(b, n), f)) for n in names for f in FIELDS)
-
-
-def test_skinner_equals_the_definition() -> None:
-    avatar = tiny_avatar().to(torch.float64)
-    motion = tiny_motion()[7].to(torch.float64)
-    raw = blend_parameters(avatar.neutral, avatar.deltas, avatar.coefficients(motion))
-    raw = join([raw, avatar.mouth_upper, avatar.mouth_lower])
-    weights = [avatar.skin_weights]
-    weights += [row.expand(20, -1) for row in (avatar.mouth_upper_weights, avatar.mouth_lower_weights)]
-    skinner = Skinner(torch.cat(weights), avatar.pose_basis)
-    fast = skinner(raw, avatar.transforms(motion), avatar.pose_feature(motion)).splats
-    slow = avatar.pose(motion)
-    for name in ("means", "scales", "opacities", "sh", "sh_frames"):
-        # A Gaussian bound to one joint by all but a millionth takes that joint's rotation as its own.
-        assert (getattr(fast, name) - getattr(slow, name)).abs().max() < 1e-6, name
-    turned = torch.minimum((fast.quats - slow.quats).abs(), (fast.quats + slow.quats).abs())
-    assert turned.max() < 1e-6
-
-
-def test_skinning_gradient_by_hand_equals_autograd() -> None:
-    avatar = tiny_avatar().to(torch.float64)
-    motion = tiny_motion()[3].to(torch.float64)
-    raw = avatar.neutral.map(lambda t: t.clone().requires_grad_())
-    skinner = Skinner(avatar.skin_weights, avatar.pose_basis)
-    transforms, feature = avatar.transforms(motion), avatar.pose_feature(motion)
-    posed = skinner(raw, transforms, feature)
-    upstream = [torch.randn_like(t) for t in (posed.splats.means, posed.splats.quats, posed.splats.scales)]
-    upstream += [torch.randn_like(posed.splats.opacities), torch.randn_like(posed.splats.sh)]
-    outputs = [posed.splats.means, posed.splats.quats, posed.splats.scales, posed.splats.opacities, posed.splats.sh]
-    torch.autograd.backward(outputs, upstream)
-    found = skinning_gradient(posed, Splats(*upstream))
-    for name, value in each(found):
-        assert (value - getattr(raw, name).grad).abs().max() < 1e-10, name
 
 
 class PlainTraining:
@@ -259,7 +225,7 @@ def test_training_learns(clip: tuple[Dataset, TrackedSequence], tmp_path: Path) 
     dataset, sequence = clip
     before = first_avatar(dataset, sequence, tiny_head(), TINY)
     after = train(dataset, sequence, tiny_head(), replace(TINY, steps=250), tmp_path)
-    scores = [evaluate(avatar, dataset, sequence, dataset.split.test) for avatar in (before, after)]
+    scores = [evaluate(a, dataset, sequence, dataset.split.test, refine=False) for a in (before, after)]
     assert scores[1]["psnr"] > scores[0]["psnr"] + 4
     assert scores[1]["ssim"] > scores[0]["ssim"] + 0.05
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
@@ -274,6 +240,10 @@ def test_scores_are_jsonable_and_complete(clip: tuple[Dataset, TrackedSequence])
     assert scores["lpips"] is None
     assert scores["frames"] == list(dataset.split.test)
     assert len(scores["psnr_per_frame"]) == len(dataset.split.test)
+    assert scores["psnr_as_tracked"] is not None
+    plain = evaluate(avatar, dataset, sequence, dataset.split.test, refine=False)
+    assert abs(plain["psnr"] - scores["psnr_as_tracked"]) < 1e-6
+    assert "psnr_as_tracked" not in plain
     assert abs(np.mean(scores["psnr_per_frame"]) - scores["psnr"]) < 1e-3
     assert abs(scores["psnr_per_channel"] - scores["psnr"]) < 1
     picture = comparison(avatar, dataset, sequence, dataset.split.test[:2])

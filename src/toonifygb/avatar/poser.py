@@ -8,7 +8,7 @@ import torch
 
 from toonifygb import render
 from toonifygb.avatar.fields import cut, cut_deltas, each, join, last_changed, rows
-from toonifygb.avatar.skinner import Skinner
+from toonifygb.avatar.skinning import pose_offsets
 from toonifygb.structures import GaussianParams
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ class Poser:
         weights = [avatar.skin_weights]
         weights.append(avatar.mouth_upper_weights.expand(avatar.mouth_upper.n, -1))
         weights.append(avatar.mouth_lower_weights.expand(avatar.mouth_lower.n, -1))
-        self._skinner = Skinner(torch.cat(weights), avatar.pose_basis)
+        self._weights = torch.cat(weights)
         self._n_expression = avatar.n_expressions + avatar.n_eyelids
         dtype = torch.bfloat16 if half else torch.float32
         expression = cut(avatar.deltas, 0, self._n_expression)
@@ -51,8 +51,9 @@ class Poser:
         with torch.no_grad():
             psi = self._avatar.coefficients(motion)
             raw = self._blend([psi[: self._n_expression].contiguous(), psi[self._n_expression :].contiguous()])
-            transforms, feature = self._avatar.transforms(motion), self._avatar.pose_feature(motion)
-            return self._skinner(raw, transforms, feature).splats
+            face = raw.means[: self._avatar.neutral.n]
+            face += pose_offsets(self._avatar.pose_feature(motion), self._avatar.pose_basis)
+            return self._kernels.skin(raw, self._weights, self._avatar.transforms(motion))
 
     def _blend(self, coefficients: list[Float[Tensor, " k"]]) -> GaussianParams:
         blended = {}

@@ -12,7 +12,7 @@ import torch
 
 from toonifygb.avatar import MouthVolume
 from toonifygb.avatar.fields import cut, join
-from toonifygb.avatar.skinner import Skinner, skinning_gradient
+from toonifygb.avatar.skinning import pose_offsets
 from toonifygb.render import RenderInfo
 from toonifygb.structures import GaussianParams, Splats
 from toonifygb.train.losses import LossTerms, LossWeights, image_gradients, mouth_loss
@@ -73,7 +73,6 @@ class Stepper:
 
     def rebind(self) -> None:
         """Prepares again what depends on the set of Gaussians; after densification."""
-        self._skinner = Skinner(self.state.skin_weights, self.state.pose_basis)
         self._optimizer = Optimizer(self.state, self._config.steps, self._kernels)
 
     @property
@@ -94,15 +93,17 @@ class Stepper:
     def _gradient(self, index: int, psi: Coefficients, info: RenderInfo | None) -> tuple[GaussianParams, LossTerms]:
         """Gradient of the whole objective for the blended raw parameters of one frame."""
         raw = blend(self.state, psi, self._kernels)
-        posed = self._skinner(raw, self._transforms[index], self._features[index])
-        leaves, frames = _leaves(posed.splats), posed.splats.sh_frames
-        rendering = self._renderer.render(
-            Splats(*leaves, sh_frames=frames), self._dataset.camera(index), sh_degree=self.sh_degree, info=info
-        )
+        raw.means[: self.state.counts.face].add_(pose_offsets(self._features[index], self.state.pose_basis))
+        binding = (self.state.skin_weights, self._transforms[index])
+        splats = self._kernels.skin(raw, *binding)
+        leaves = _leaves(splats)
+        cut_off = Splats(*leaves, sh_frames=splats.sh_frames)
+        camera = self._dataset.camera(index)
+        rendering = self._renderer.render(cut_off, camera, sh_degree=self.sh_degree, info=info)
         target, matte = self._dataset.target(index)
         photo, alpha, v_color, v_alpha = image_gradients(rendering, target, matte, self._weights, self._kernels)
         found = torch.autograd.grad([rendering.color, rendering.alpha], leaves, [v_color, v_alpha])
-        gradient = skinning_gradient(posed, Splats(*found))
+        gradient = self._kernels.skin_gradient(raw, *binding, Splats(*found))
         return gradient, LossTerms(photo, alpha, self._add_mouth_gradient(gradient))
 
     def _add_mouth_gradient(self, gradient: GaussianParams) -> float:
