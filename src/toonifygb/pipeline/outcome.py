@@ -216,6 +216,7 @@ def report_page(source: Source, run: Run, config: RunConfig, values: dict[str, A
         ("frames", f"{values['n_frames']} ({values['n_train']} trained on, {values['n_test']} held out)"),
         ("crop", f"{values['resolution']} px square"),
         ("tracked video", values["track_on"]),
+        ("PSNR with head pose fitted to each picture", f"{values['psnr_pose_refined']:.2f} dB"),
         ("ISI", f"{values['isi']:.4f}"),
         ("peak memory", f"{values['peak_memory_mb']:.0f} MB"),
         *((name, str(version)) for name, version in values["versions"].items()),

@@ -42,26 +42,26 @@ def evaluate(
 
     Protocol: render clamped to 0..1 against photo × matte on black, float, the whole training crop. ``psnr`` takes
     one mean over all channels, ``psnr_per_channel`` is 3DGB's variant; every score is the mean over the frames.
-    With ``refine`` the rigid head pose of each frame (six numbers) is first fitted to its pixels against the
-    finished avatar, as photometric trackers do; the scores at the landmark track's pose are then reported too,
-    under ``…_as_tracked``.
+    The motion is the landmark track's: nothing of a held-out picture beyond its landmarks is known. With
+    ``refine`` the scores after the rigid head pose of each frame (six numbers) was fitted to its pixels against the
+    finished avatar, as photometric trackers do, are reported as well, under ``…_pose_refined``.
 
     Args:
         avatar: what is judged.
         dataset: its training set, which also holds the held-out frames.
         sequence: the motion of every frame.
         frames: which to judge.
-        refine: whether the head pose is fitted first.
+        refine: whether to add the scores with fitted head poses.
         backend: rasteriser.
         threads: of the native engine.
         progress: told after every frame.
     """
     engine = {"backend": backend, "threads": threads}
-    tables = {"_as_tracked" if refine else "": _scores(avatar, dataset, sequence, frames, **engine)}
+    tables = {"": _scores(avatar, dataset, sequence, frames, **engine)}
     if refine:
         refined = refine_poses(avatar, dataset, sequence, frames, **engine, progress=progress)
-        tables[""] = _scores(avatar, dataset, refined, frames, **engine)
-    scores: dict[str, Any] = {"lpips": None, "frames": [int(index) for index in frames], "pose_refined": refine}
+        tables["_pose_refined"] = _scores(avatar, dataset, refined, frames, **engine)
+    scores: dict[str, Any] = {"lpips": None, "frames": [int(index) for index in frames]}
     for suffix, table in tables.items():
         for name, values in table.items():
             scores[f"{name}{suffix}"] = float(np.mean(values)) if values else None
