@@ -58,6 +58,7 @@ class Kernels(Protocol):
         step: int,
         *,
         factor: float = 1.0,
+        eps: float = EPS,
     ) -> None:
         """One step of Adam with a learning rate per parameter.
 
@@ -69,6 +70,7 @@ class Kernels(Protocol):
             learning_rates: see ``learning_rates``.
             step: number of this step, from 1.
             factor: of all learning rates.
+            eps: added to the root of the second moment; gradients well below it hardly move anything.
         """
         ...
 
@@ -83,6 +85,7 @@ class Kernels(Protocol):
         step: int,
         *,
         factor: float = 1.0,
+        eps: float = EPS,
         scale: Float[Tensor, "k n"] | None = None,
         widths: Sequence[int] = (),
         skip_inactive: bool = False,
@@ -102,6 +105,7 @@ class Kernels(Protocol):
             learning_rates: per parameter.
             step: number of this step, from 1.
             factor: of all learning rates.
+            eps: added to the root of the second moment; gradients well below it hardly move anything.
             scale: factor of the step per row and Gaussian; where it is 0 the delta stays as it is, and its moments
                 mean nothing.
             widths: floats per Gaussian of each parameter group in the flat vector, in order; needed with ``scale``.
@@ -211,12 +215,13 @@ class ReferenceKernels:
         step: int,
         *,
         factor: float = 1.0,
+        eps: float = EPS,
     ) -> None:
         """See ``Kernels.adam_step``."""
         first_moment.mul_(BETA1).add_((1 - BETA1) * gradient)
         second_moment.mul_(BETA2).add_((1 - BETA2) * gradient * gradient)
         mean, square = first_moment / (1 - BETA1**step), second_moment / (1 - BETA2**step)
-        parameters.sub_(factor * learning_rates * mean / (square.sqrt() + EPS))
+        parameters.sub_(factor * learning_rates * mean / (square.sqrt() + eps))
 
     def blend_adam_step(
         self,
@@ -229,6 +234,7 @@ class ReferenceKernels:
         step: int,
         *,
         factor: float = 1.0,
+        eps: float = EPS,
         scale: Float[Tensor, "k n"] | None = None,
         widths: Sequence[int] = (),
         skip_inactive: bool = False,
@@ -244,7 +250,7 @@ class ReferenceKernels:
                 rates = learning_rates * expand_scale(scale[k : k + 1], widths)[0]
                 live = rates != 0
             delta, first, second = deltas[k][live], first_moment[k][live], second_moment[k][live]
-            self.adam_step(delta, first, second, psi[k] * gradient[live], rates[live], step, factor=factor)
+            self.adam_step(delta, first, second, psi[k] * gradient[live], rates[live], step, factor=factor, eps=eps)
             deltas[k, live], first_moment[k, live], second_moment[k, live] = delta, first, second
 
     def skin(

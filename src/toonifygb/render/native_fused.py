@@ -32,8 +32,8 @@ def _address(tensor: Tensor, name: str, shape: tuple[int, ...], dtype: torch.dty
     return tensor.data_ptr()
 
 
-def _rates(step: int, factor: float) -> library.AdamRates:
-    return library.AdamRates(beta1=BETA1, beta2=BETA2, eps=EPS, factor=factor, step=step)
+def _rates(step: int, factor: float, eps: float) -> library.AdamRates:
+    return library.AdamRates(beta1=BETA1, beta2=BETA2, eps=eps, factor=factor, step=step)
 
 
 def _skin(raw: GaussianParams, weights: Tensor, transforms: Tensor) -> library.Skin:
@@ -111,6 +111,7 @@ class NativeKernels:
         step: int,
         *,
         factor: float = 1.0,
+        eps: float = EPS,
     ) -> None:
         """See ``Kernels.adam_step``."""
         shape = (parameters.numel(),)
@@ -121,7 +122,7 @@ class NativeKernels:
             _address(gradient, "gradient", shape),
             _address(learning_rates, "learning_rates", shape),
             parameters.numel(),
-            _rates(step, factor),
+            _rates(step, factor, eps),
             self.threads,
         )
 
@@ -136,6 +137,7 @@ class NativeKernels:
         step: int,
         *,
         factor: float = 1.0,
+        eps: float = EPS,
         scale: Float[Tensor, "k n"] | None = None,
         widths: Sequence[int] = (),
         skip_inactive: bool = False,
@@ -161,7 +163,7 @@ class NativeKernels:
             groups=len(groups),
             skip_inactive=skip_inactive,
         )
-        self._engine.tgb_blend_adam(state, _rates(step, factor), self.threads)
+        self._engine.tgb_blend_adam(state, _rates(step, factor, eps), self.threads)
 
     def skin(
         self, raw: GaussianParams, weights: Float[Tensor, "n 5"], transforms: Float[Tensor, "5 4 4"]
