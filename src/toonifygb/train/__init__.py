@@ -5,6 +5,7 @@ from __future__ import annotations
 from toonifygb.train.data import Dataset, build_dataset, crop, crop_boxes, load_dataset, split_frames
 from toonifygb.train.evaluate import comparison, evaluate
 from toonifygb.train.loop import first_avatar, train
+from toonifygb.train.refine import refine_poses
 
 __all__ = [
     "Dataset",
@@ -15,6 +16,7 @@ __all__ = [
     "evaluate",
     "first_avatar",
     "load_dataset",
+    "refine_poses",
     "split_frames",
     "train",
 ]
