@@ -55,7 +55,7 @@ def fit(
     focal_px: float | None = None,
     progress: Progress = SILENT,
 ) -> TrackedSequence:
-    """Explains the landmarks of a clip by a head model.
+    """Explains the landmarks of a clip by a head model; equal inputs give equal bits.
 
     Args:
         landmarks: of the whole clip; frames without a face are NaN.
@@ -71,6 +71,28 @@ def fit(
         InputError: a focal length or frame rate that is not positive.
     """
     _check(landmarks, fps, focal_px)
+    # Linear algebra rounds differently with the arrays' alignment and the number of threads. Copies made by torch
+    # are always aligned, and the matrices here are too small for more than one thread to pay.
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return _fit(
+            landmarks.map(torch.clone), head.map(torch.clone), config, fps, source_sha256, focal_px, progress
+        )
+    finally:
+        torch.set_num_threads(before)
+
+
+def _fit(
+    landmarks: Landmarks,
+    head: HeadModel,
+    config: TrackConfig,
+    fps: float,
+    source_sha256: str,
+    focal_px: float | None,
+    progress: Progress,
+) -> TrackedSequence:
+    """What ``fit`` does, on aligned arrays and one thread."""
     valid = landmarks.valid & ~gaps.jumps(landmarks.points, fps)
     clip = _Clip(landmarks, head, config, fps)
     frames = valid.nonzero()[:, 0]
