@@ -114,7 +114,7 @@ class RunConfig:
 
 
 DRAFT = TrainConfig()
-STANDARD = TrainConfig(n_gaussians=32_000, n_mouth_gaussians=4_000, resolution=512, steps=7_000)
+STANDARD = TrainConfig(n_gaussians=32_000, n_mouth_gaussians=4_000, resolution=512, steps=6_000)
 PAPER = TrainConfig(n_gaussians=50_000, n_mouth_gaussians=14_000, resolution=512, steps=40_000, sh_degree=3)
 PRESETS: dict[Quality, TrainConfig] = {"draft": DRAFT, "standard": STANDARD, "paper": PAPER}
 
