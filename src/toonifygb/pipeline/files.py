@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
@@ -15,7 +16,8 @@ from toonifygb.structures import Landmarks
 def save_landmarks(landmarks: Landmarks, path: Path) -> None:
     """Writes landmarks so that the file is at no moment half there."""
     temporary = path.with_name(f".{path.name}.part")
-    size = {"width": str(landmarks.width), "height": str(landmarks.height)}
+    # One entry: several would be written in an order that changes from process to process.
+    size = {"size": json.dumps([landmarks.width, landmarks.height])}
     tensors = {"points": landmarks.points.contiguous(), "score": landmarks.score.contiguous()}
     save_file(tensors, temporary, metadata=size)
     os.replace(temporary, path)
@@ -29,9 +31,7 @@ def load_landmarks(path: Path) -> Landmarks:
     """
     try:
         with safe_open(path, framework="pt") as file:
-            size = file.metadata()
-            return Landmarks(
-                file.get_tensor("points"), file.get_tensor("score"), int(size["width"]), int(size["height"])
-            )
-    except (SafetensorError, KeyError, TypeError) as error:
+            width, height = json.loads(file.metadata()["size"])
+            return Landmarks(file.get_tensor("points"), file.get_tensor("score"), width, height)
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} does not hold landmarks ({error})", "delete it and run again") from error
