@@ -89,6 +89,19 @@ def test_warped_landmarks_keep_gaps() -> None:
     assert 0.3 * shift < (half.points[0] - marks.points[0]).norm(dim=-1).max() < 0.8 * shift
 
 
+def test_warped_frames_have_the_outlines_of_the_style() -> None:
+    pictures = scene.frames(2, 200, 200, noise=20)
+    marks = scene.landmarks(2, 200, 200)
+    plain = list(stylize.warp_frames(pictures, marks, stylize.get("none")))
+    assert all(np.array_equal(ours, theirs) for ours, theirs in zip(plain, pictures, strict=True))
+    warped = list(stylize.warp_frames(pictures, marks, stylize.get("toon")))
+    assert len(warped) == 2
+    amount = stylize.get("toon").exaggeration
+    expected = exaggerate.warp(pictures[0], stylize.follow(marks).points[0], amount)
+    assert np.array_equal(warped[0], expected)
+    assert not np.array_equal(warped[0], pictures[0])
+
+
 # --- anchors ------------------------------------------------------------------------------------------------------
 
 

@@ -245,7 +245,10 @@ def cut_dataset(source: Source, run: Run, config: RunConfig, tracked: str, style
         sequence = track.load(run.file("track.safetensors"))
         model = head.load("open")
         frames = (f[: source.info.height, : source.info.width] for f in video.read(run.file("stylized.mp4")))
-        pairs = head_frames(source.frames(config), frames, sequence, model)
+        landmarks = load_landmarks(run.work("landmarks.safetensors"))
+        stylizer = stylize.get(config.stylize.style)
+        photos = stylize.warp_frames(source.frames(config), landmarks, stylizer, config.stylize.strength)
+        pairs = head_frames(photos, frames, sequence, model)
         train.build_dataset(pairs, sequence, model, config.train, out, progress=progress)
 
     keys = ("resolution", "crop_scale", "test_share", "max_test_frames")
@@ -267,7 +270,14 @@ def head_frames(
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Stylised frames with the matte of the head: hair kept, cut below the neck.
 
-    The person is segmented in the original, whose photographs the segmenter knows, and the edge is refined there.
+    The person is segmented in photographs with the style's outlines: the segmenter knows photographs, and the matte
+    must end where the drawn person does.
+
+    Args:
+        original: filmed frames, warped as the style warps them.
+        styled: the same frames in the style.
+        sequence: the track.
+        model: the head model of the track.
 
     Yields:
         frame uint8 ``(h, w, 3)`` and matte float32 ``(h, w)``.

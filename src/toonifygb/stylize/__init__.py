@@ -7,7 +7,7 @@ from toonifygb.stylize.base import Stylizer, available, get, register
 from toonifygb.stylize.ink import Ink
 from toonifygb.stylize.paint import Paint
 from toonifygb.stylize.plain import Plain
-from toonifygb.stylize.run import prepare, stylize_frames, warp_landmarks
+from toonifygb.stylize.run import prepare, stylize_frames, warp_frames, warp_landmarks
 from toonifygb.stylize.toon import Toon
 
 for _style in (Toon, Paint, Ink, Plain):
@@ -22,5 +22,6 @@ __all__ = [
     "prepare",
     "register",
     "stylize_frames",
+    "warp_frames",
     "warp_landmarks",
 ]
