@@ -268,7 +268,7 @@ def test_no_path_of_one_machine():
     assert not found, "\n".join(found)
 
 
-@pytest.mark.parametrize("text", ["open('/work/x')", "cd /tmp", "PATH=/root/bin", "in /home/ann/clips"])
+@pytest.mark.parametrize("text", ["open('/tmp/x')", "cd /tmp", "PATH=/root/bin", "in /home/ann/clips"])
 def test_machine_paths_are_noticed(text: str):
     assert MACHINE_PATH.search(text)
 
