@@ -19,7 +19,7 @@ Leading batch axes are written ``*b``. Records are frozen: a stage returns a new
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Literal, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from torch import Tensor
 
@@ -214,6 +214,5 @@ class Split:
     test: tuple[int, ...]
 
 
-Scheme = Literal["mediapipe478"]
 Frame: TypeAlias = "UInt8[np.ndarray, 'h w 3']"
 """An image at the file boundary: numpy uint8 RGB, contiguous."""
