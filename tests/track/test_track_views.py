@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -11,6 +12,7 @@ from track_scene import SIZE, open_head, true_clip, without
 
 from toonifygb import track
 from toonifygb.structures import Landmarks, TrackedSequence
+from toonifygb.track import overlay
 from toonifygb.track.source import lasting_displacement
 
 
@@ -67,6 +69,30 @@ def test_overlay_of_a_head_outside_the_image_is_the_image(sequence: TrackedSeque
 def test_overlay_works_at_any_image_size(sequence: TrackedSequence) -> None:
     small = np.zeros((40, 300, 3), np.uint8)
     assert track.overlay.draw(small, sequence, 0, open_head()).shape == small.shape
+
+
+def test_the_surface_is_that_painted_in_colour(sequence: TrackedSequence) -> None:
+    """One channel of tones looked up in a table, blended in one pass, against three channels blended in float."""
+    pose = track.Overlay(sequence, open_head())._project(3)
+    canvas = np.random.default_rng(0).integers(0, 256, (SIZE, SIZE, 3), np.uint8)
+    layer = np.zeros_like(canvas)
+    colors = np.clip(pose.shade[:, None] * overlay.SKIN, 1, 255)
+    corners = np.round((pose.vertices[pose.faces] - 0.5) * 2**overlay.SHIFT).astype(np.int32)
+    for triangle, color in zip(corners, colors.tolist(), strict=True):
+        cv2.fillConvexPoly(layer, triangle, color, cv2.LINE_8, overlay.SHIFT)
+    soft = (
+        cv2.GaussianBlur((layer.max(-1) > 0).astype(np.float64), (0, 0), 2.0)[..., None] * overlay.SURFACE_OPACITY
+    )
+    expected = canvas * (1 - soft) + layer * soft
+    found = overlay._surface(canvas, pose, overlay.SKIN)
+    assert (found != canvas).any(-1).mean() > 0.1
+    assert np.abs(found - expected).max() < 1
+
+
+def test_one_overlay_draws_any_frame(sequence: TrackedSequence) -> None:
+    kept = track.Overlay(sequence, open_head())
+    for index in (2, 0):
+        assert np.array_equal(kept(grey(), index), track.overlay.draw(grey(), sequence, index, open_head()))
 
 
 def test_boxes_hold_their_points(sequence: TrackedSequence) -> None:

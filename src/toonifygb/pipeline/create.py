@@ -208,12 +208,13 @@ def fit_track(source: Source, run: Run, config: RunConfig, chosen: str) -> str:
             progress=progress,
         )
         run.problems("track", list(track.report(sequence).problems))
+        overlay = track.Overlay(sequence, model)
         with video.Writer(
             overlay_path, source.info.width, source.info.height, source.info.fps, audio_from=source.path
         ) as writer:
             for index, frame in enumerate(video.read(run.file("stylized.mp4"), max_frames=sequence.n_frames)):
                 cropped = frame[: source.info.height, : source.info.width]
-                writer.write(track.overlay.draw(cropped, sequence, index, model))
+                writer.write(overlay(cropped, index))
                 progress.update(index + 1, sequence.n_frames)
         track.save(sequence, out)
 

@@ -3,6 +3,7 @@
 from toonifygb.track import overlay
 from toonifygb.track.files import load, save
 from toonifygb.track.fitting import fit
+from toonifygb.track.overlay import Overlay
 from toonifygb.track.regions import Boxes, HeadRegion, head_boxes, head_region
 from toonifygb.track.source import Choice, choose_source
 from toonifygb.track.steadiness import Report, jitter_px, report
@@ -11,6 +12,7 @@ __all__ = [
     "Boxes",
     "Choice",
     "HeadRegion",
+    "Overlay",
     "Report",
     "choose_source",
     "fit",
