@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from drawn_face import draw_face
 
-from toonifygb.face.guided import box_mean, foreground_color, guided_filter
+from toonifygb.face.guided import GuidedFilter, box_mean, foreground_color
 from toonifygb.face.matting import PersonSegmenter, foreground, head_matte
 
 if TYPE_CHECKING:
@@ -60,14 +60,23 @@ def test_the_guided_filter_is_its_definition() -> None:
     guide = cv2.GaussianBlur(rng.random((24, 20, 3)).astype(np.float32), (0, 0), 1)
     matte = cv2.GaussianBlur(rng.random((24, 20)).astype(np.float32), (0, 0), 2)
     expected = guided_filter_by_definition(guide, matte, 3, 1e-3)
-    np.testing.assert_allclose(guided_filter(guide, matte, 3, 1e-3), expected, atol=2e-4)  # float32 covariances
+    np.testing.assert_allclose(GuidedFilter(guide, 3, 1e-3)(matte), expected, atol=2e-4)  # float32 covariances
+
+
+def test_one_guided_filter_refines_any_matte_as_a_fresh_one_does() -> None:
+    rng = np.random.default_rng(1)
+    guide = rng.random((30, 26, 3)).astype(np.float32)
+    mattes = rng.random((2, 30, 26)).astype(np.float32)
+    kept = GuidedFilter(guide, 4, 1e-3, step=2)
+    for matte in mattes:
+        np.testing.assert_array_equal(kept(matte), GuidedFilter(guide, 4, 1e-3, step=2)(matte))
 
 
 def test_the_fast_guided_filter_is_close_to_the_exact_one() -> None:
     truth = disc(96, 48, 48, 30)
     guide = paint(truth, (200, 150, 120), (60, 90, 140)).astype(np.float32) / 255
     coarse = box_mean(truth, 5)
-    exact, fast = (guided_filter(guide, coarse, 8, 2e-4, step) for step in (1, 2))
+    exact, fast = (GuidedFilter(guide, 8, 2e-4, step)(coarse) for step in (1, 2))
     assert np.abs(exact - fast).mean() < 0.01
 
 
@@ -138,6 +147,28 @@ def test_foreground_color_solves_the_mixing_equation_inside() -> None:
     image = paint(matte, (180, 120, 90), (20, 60, 200)).astype(np.float32) / 255
     color = foreground_color(image, matte, 16)
     assert np.abs(color - np.array([180, 120, 90]) / 255)[matte > 0.1].max() < 0.06
+
+
+def foreground_color_by_definition(image: np.ndarray, matte: np.ndarray, radius: int) -> np.ndarray:
+    """Blur-fusion in double precision, all channels at once."""
+    alpha = matte[..., None].astype(np.float64)
+    front = back = image.astype(np.float64)
+    for r in (radius, max(1, radius // 2), max(1, radius // 8)):
+        mean_f, mean_b = (
+            box_mean(color * weight, r) / (box_mean(weight, r) + 1e-5)[..., None]
+            for color, weight in ((front, alpha**3), (back, (1 - alpha) ** 3))
+        )
+        front = np.clip(mean_f + alpha * (image - alpha * mean_f - (1 - alpha) * mean_b), 0, 1)
+        back = mean_b
+    return front
+
+
+def test_foreground_color_is_its_definition() -> None:
+    rng = np.random.default_rng(2)
+    image = cv2.GaussianBlur(rng.random((60, 50, 3)).astype(np.float32), (0, 0), 1)
+    matte = disc(60, 25, 30, 18, softness=9)[:, :50]
+    expected = foreground_color_by_definition(image, matte, 12)
+    np.testing.assert_allclose(foreground_color(image, matte, 12), expected, atol=2e-4)
 
 
 def scene(side: int, left: int, top: int) -> np.ndarray:

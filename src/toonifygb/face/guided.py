@@ -1,6 +1,7 @@
 """Soft mattes from coarse ones: guided filter, and the foreground colour under a soft edge.
 
-All images here are float32, 0..1. Windows are boxes, so every cost is independent of their radius.
+All images here are float32, 0..1. Windows are boxes, so every cost is independent of their radius. Channels are
+kept as planes: arithmetic on them is several times faster than numpy's along an axis of three.
 """
 
 from __future__ import annotations
@@ -11,7 +12,11 @@ import cv2
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
     from jaxtyping import Float
+
+    Plane = Float[np.ndarray, "h w"]
 
 
 def box_mean(image: Float[np.ndarray, "h w *c"], radius: int) -> Float[np.ndarray, "h w *c"]:
@@ -20,50 +25,79 @@ def box_mean(image: Float[np.ndarray, "h w *c"], radius: int) -> Float[np.ndarra
     return cv2.boxFilter(image, -1, size, borderType=cv2.BORDER_REFLECT_101)  # type: ignore[return-value]
 
 
-def guided_filter(
-    guide: Float[np.ndarray, "h w 3"], matte: Float[np.ndarray, "h w"], radius: int, epsilon: float, step: int = 1
-) -> Float[np.ndarray, "h w"]:
-    """The matte whose edges follow the guide: He et al. 2013, colour guide (eqs. 19-21), fast variant of 2015.
+class GuidedFilter:
+    """Mattes whose edges follow an image: He et al. 2013, colour guide (eqs. 19-21), fast variant of 2015.
 
-    In every window the result is an affine function of the guide's colour, fitted to the given matte.
+    In every window the result is an affine function of the guide's colour, fitted to the given matte. What depends
+    on the guide alone is computed once.
 
     Args:
-        guide: the image the matte belongs to.
-        matte: the matte to refine.
-        radius: half the window's side, px; about the distance by which the matte's edge may be wrong.
+        guide: the image the mattes belong to.
+        radius: half the window's side, px; about the distance by which a matte's edge may be wrong.
         epsilon: colour variance below which a window counts as flat; flat windows give their mean.
         step: fits on an image reduced by this factor; 1 is exact.
     """
-    height, width = matte.shape
-    small = (max(1, width // step), max(1, height // step))
-    image = guide if step == 1 else cv2.resize(guide, small, interpolation=cv2.INTER_AREA)
-    target = matte if step == 1 else cv2.resize(matte, small, interpolation=cv2.INTER_AREA)
-    r = max(1, radius // step)
-    mean_i, mean_p = box_mean(image, r), box_mean(target, r)
-    rows, columns = np.triu_indices(3)
-    products = box_mean(image[..., rows] * image[..., columns], r)
-    products -= mean_i[..., rows] * mean_i[..., columns]
-    covariance_ip = box_mean(image * target[..., None], r) - mean_i * mean_p[..., None]
-    slope = _solve_symmetric(products, covariance_ip, epsilon)
-    offset = mean_p - (slope * mean_i).sum(-1)
-    mean_slope, mean_offset = box_mean(slope, r), box_mean(offset, r)
-    if step > 1:
-        mean_slope = cv2.resize(mean_slope, (width, height), interpolation=cv2.INTER_LINEAR)
-        mean_offset = cv2.resize(mean_offset, (width, height), interpolation=cv2.INTER_LINEAR)
-    return (mean_slope * guide).sum(-1) + mean_offset
+
+    def __init__(self, guide: Float[np.ndarray, "h w 3"], radius: int, epsilon: float, step: int = 1) -> None:
+        height, width = guide.shape[:2]
+        self._size = (width, height)
+        self._reduced = (max(1, width // step), max(1, height // step))
+        self._radius = max(1, radius // step)
+        self._guide = cv2.split(guide)
+        self._colors = cv2.split(self._reduce(guide))
+        self._means = [self._mean(color) for color in self._colors]
+        self._solve = _solver([self._covariance(i, j) for i in range(3) for j in range(i, 3)], epsilon)
+
+    def __call__(self, matte: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+        """The refined matte."""
+        target = self._reduce(matte)
+        mean = self._mean(target)
+        covariances = [
+            self._mean(color * target) - color_mean * mean
+            for color, color_mean in zip(self._colors, self._means, strict=True)
+        ]
+        slopes = self._solve(covariances)
+        offset = mean - _dot(slopes, self._means)
+        mean_slopes = [self._enlarge(self._mean(slope)) for slope in slopes]
+        return _dot(mean_slopes, self._guide) + self._enlarge(self._mean(offset))
+
+    def _mean(self, plane: Plane) -> Plane:
+        return box_mean(plane, self._radius)
+
+    def _covariance(self, i: int, j: int) -> Plane:
+        return self._mean(self._colors[i] * self._colors[j]) - self._means[i] * self._means[j]
+
+    def _reduce(self, image: Float[np.ndarray, "h w *c"]) -> Float[np.ndarray, "r s *c"]:
+        return _resized(image, self._reduced, cv2.INTER_AREA)
+
+    def _enlarge(self, plane: Plane) -> Plane:
+        return _resized(plane, self._size, cv2.INTER_LINEAR)
 
 
-def _solve_symmetric(
-    upper: Float[np.ndarray, "h w 6"], right: Float[np.ndarray, "h w 3"], epsilon: float
-) -> Float[np.ndarray, "h w 3"]:
-    """Solution of (A + epsilon I) x = right by cofactors; ``upper`` is A's upper triangle, row by row."""
-    a, b, c, d, e, f = np.moveaxis(upper.astype(np.float64), -1, 0)
+def _resized(image: np.ndarray, size: tuple[int, int], method: int) -> np.ndarray:
+    return image if image.shape[1::-1] == size else cv2.resize(image, size, interpolation=method)
+
+
+def _dot(first: Sequence[Plane], second: Sequence[Plane]) -> Plane:
+    """Sum over the channels of the products."""
+    (a, b, c), (x, y, z) = first, second
+    return a * x + b * y + c * z
+
+
+def _solver(upper: Sequence[Plane], epsilon: float) -> Callable[[Sequence[Plane]], list[Plane]]:
+    """Function that solves (A + epsilon I) x = right at every pixel, by cofactors in double precision.
+
+    Args:
+        upper: A's upper triangle, row by row.
+        epsilon: added to A's diagonal.
+    """
+    a, b, c, d, e, f = (plane.astype(np.float64) for plane in upper)
     a, d, f = a + epsilon, d + epsilon, f + epsilon
     aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
     dd, ee, ff = a * f - c * c, b * c - a * e, a * d - b * b
-    x, y, z = np.moveaxis(right, -1, 0)
-    solved = np.stack([aa * x + bb * y + cc * z, bb * x + dd * y + ee * z, cc * x + ee * y + ff * z], -1)
-    return (solved / (a * aa + b * bb + c * cc)[..., None]).astype(np.float32)
+    determinant = a * aa + b * bb + c * cc
+    rows = ((aa, bb, cc), (bb, dd, ee), (cc, ee, ff))
+    return lambda right: [(_dot(row, right) / determinant).astype(np.float32) for row in rows]
 
 
 def foreground_color(
@@ -76,12 +110,15 @@ def foreground_color(
     are nearly pure know the colours, mixed ones would carry the background into F. Where the matte is 1 the result
     is the image; far outside it is the colour of the nearest foreground.
     """
-    alpha = matte[..., None]
-    foreground = background = image
-    weight_f, weight_b = matte**3, (1 - matte) ** 3
+    rest = 1 - matte
+    weight_f, weight_b = matte**3, rest**3
+    channels = cv2.split(image)
+    foregrounds, backgrounds = list(channels), list(channels)
     for r in (radius, max(1, radius // 2), max(1, radius // 8)):
-        mean_f = box_mean(foreground * weight_f[..., None], r) / (box_mean(weight_f, r) + 1e-5)[..., None]
-        mean_b = box_mean(background * weight_b[..., None], r) / (box_mean(weight_b, r) + 1e-5)[..., None]
-        foreground = np.clip(mean_f + alpha * (image - alpha * mean_f - (1 - alpha) * mean_b), 0, 1)
-        background = mean_b
-    return foreground
+        total_f, total_b = box_mean(weight_f, r) + 1e-5, box_mean(weight_b, r) + 1e-5
+        for i, channel in enumerate(channels):
+            mean_f = box_mean(foregrounds[i] * weight_f, r) / total_f
+            mean_b = box_mean(backgrounds[i] * weight_b, r) / total_b
+            foregrounds[i] = np.clip(mean_f + matte * (channel - matte * mean_f - rest * mean_b), 0, 1)
+            backgrounds[i] = mean_b
+    return cv2.merge(foregrounds)

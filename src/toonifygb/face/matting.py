@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from toonifygb.face.crop import Square, as_batch, cut
-from toonifygb.face.guided import box_mean, foreground_color, guided_filter
+from toonifygb.face.guided import GuidedFilter, box_mean, foreground_color
 from toonifygb.face.networks import load_network
 
 if TYPE_CHECKING:
@@ -124,10 +124,10 @@ def head_matte(
     rows, columns = (slice(max(0, s.start - 2 * radius), s.stop + 2 * radius) for s in window)
     guide = frame[rows, columns].astype(np.float32) / 255
     person = person_matte[rows, columns].astype(np.float32)
-    matte = person
+    matte, (least, greatest) = person, _limits(person, radius)
+    refine = GuidedFilter(guide, radius, _EPSILON, step=max(1, radius // 4))
     for black, white in _CONTRAST:
-        matte = guided_filter(guide, matte, radius, _EPSILON, step=max(1, radius // 4))
-        matte = np.clip(matte, *_limits(person, radius))
+        matte = np.clip(refine(matte), least, greatest)
         matte = np.clip((matte - black) / (white - black), 0, 1).astype(np.float32)
     if solid_mask is not None:
         matte = np.maximum(matte, solid_mask[rows, columns])
