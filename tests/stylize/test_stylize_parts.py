@@ -64,6 +64,18 @@ def test_warp_leaves_the_rest_alone() -> None:
     assert exaggerate.warp(frame, scene.face_at(200, 160), Exaggeration()) is frame
 
 
+def test_warp_in_boxes_is_the_warp_of_the_whole_picture() -> None:
+    frame = scene.frames(1, 200, 160, noise=20)[0]
+    grid = filters.pixel_grid(*frame.shape[:2])
+    for points in (
+        scene.face_at(200, 160),
+        scene.face_at(200, 160) + np.float32([70, -60]),
+    ):  # the second is cut off
+        where = grid + exaggerate.offsets(grid + np.float32(0.5), points, CARICATURE)
+        expected = filters.sample(frame, where, cv2.INTER_CUBIC)
+        assert np.array_equal(exaggerate.warp(frame, points, CARICATURE), expected)
+
+
 def test_picture_follows_the_warp() -> None:
     """A dot drawn at an iris is found where ``move_points`` says."""
     points = scene.face_at(300, 300)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from toonifygb.stylize.anchors import EYES, Eye, box_around, face_widths, is_empty
-from toonifygb.stylize.filters import sample, smoothstep
+from toonifygb.stylize.filters import pixel_grid, sample, smoothstep
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -60,6 +60,11 @@ class _Bump:
     """Share by which look-ups near the centre are drawn towards it."""
     push: Float[np.ndarray, " 2"] | None = None
     """Shift of the look-ups at the centre, px."""
+
+    @property
+    def extremes(self) -> Float[np.ndarray, "2 2"]:
+        """Corners of a box that holds the region."""
+        return np.stack([self.centre - self.reach, self.centre + self.reach])
 
 
 def _bumps(points: Points, amount: Exaggeration) -> list[_Bump]:
@@ -154,14 +159,14 @@ def warp(image: np.ndarray, points: Points, amount: Exaggeration) -> np.ndarray:
     bumps = _bumps(points, amount)
     if not bumps:
         return image
-    reach = np.array([bump.reach for bump in bumps])[:, None]
-    centres = np.array([bump.centre for bump in bumps])
-    box = box_around(np.concatenate([centres - reach, centres + reach]), 0.0, image.shape)
+    box = box_around(np.concatenate([bump.extremes for bump in bumps]), 0.0, image.shape)
     if is_empty(box):
         return image
-    y, x = np.mgrid[box].astype(np.float32)
-    indices = cv2.merge([x, y])
-    where = indices + _offsets(indices + np.float32(0.5), bumps)
+    indices = pixel_grid(*image.shape[:2])
+    where = indices.copy()
+    for bump in bumps:  # each in its own box, beyond which it moves nothing
+        own = box_around(bump.extremes, 0.0, image.shape)
+        where[own] += _offsets(indices[own] + np.float32(0.5), [bump])
     out = image.copy()
-    out[box] = sample(image, where, cv2.INTER_CUBIC)
+    out[box] = sample(image, where[box], cv2.INTER_CUBIC)
     return out

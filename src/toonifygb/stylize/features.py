@@ -138,7 +138,7 @@ def _draw_blush(painted: Picture, points: Points, presence: float, unit: float) 
     face = anchors.face_mask(shape, own, 0.03 * unit) * np.float32(presence)
     for cheek in CHEEKS:
         glow = anchors.spot(shape, own[cheek], 0.085 * unit) * face
-        painted[box] += glow[..., None] * np.array([0.0, 4.0, 1.5], np.float32)
+        painted[box] += cv2.merge([np.zeros_like(glow), 4.0 * glow, 1.5 * glow])
 
 
 def draw_lashes(rgb: Picture, points: Points, presence: float, unit: float, ink: np.ndarray) -> None:

@@ -37,7 +37,7 @@ def to_rgb(lab: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
 
 def to_bytes(rgb: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """Colours 0..1 to bytes, rounded to nearest."""
-    return np.clip(np.rint(rgb * 255.0), 0, 255).astype(np.uint8)
+    return cv2.convertScaleAbs(np.maximum(rgb, 0.0), alpha=255.0)
 
 
 def working_size(shape: tuple[int, ...], unit: float, face_px: float) -> tuple[float, tuple[int, int]]:
@@ -74,7 +74,9 @@ def wide_blur(image: np.ndarray, sigma_px: float) -> np.ndarray:
 
 def smoothstep(low: float, high: float, value: np.ndarray) -> np.ndarray:
     """0 below ``low``, 1 above ``high``, and a cubic with level ends between."""
-    t = np.clip((value - np.float32(low)) * np.float32(1.0 / (high - low)), 0.0, 1.0)
+    t = np.asarray(value - np.float32(low))
+    t *= np.float32(1.0 / (high - low))
+    np.clip(t, 0.0, 1.0, out=t)
     return t * t * (3.0 - 2.0 * t)
 
 
@@ -206,7 +208,8 @@ def kuwahara(lab: Picture, tangents: Field, anisotropy: Plane, radius_px: float)
         offset = cv2.addWeighted(axes[0], float(np.cos(angle)), axes[1], float(np.sin(angle)), 0.0)
         total += sample(table, grid + offset)
         total += sample(table, grid - offset)
-    return total[..., :3] / spread(np.ascontiguousarray(total[..., 3]), 3)
+    *sums, weights = cv2.split(total)
+    return cv2.merge([cv2.divide(each, weights) for each in sums])
 
 
 CURVE_STEPS = 4096
@@ -214,8 +217,8 @@ CURVE_STEPS = 4096
 
 def curve_lookup(values: Plane, curve: Float[np.ndarray, " n"], top: float = LAB_RANGE) -> Plane:
     """Values 0..top through a tabulated curve; the table is fine enough that nearest entry is exact to 0.03 L."""
-    index = np.clip(values * np.float32((len(curve) - 1) / top) + np.float32(0.5), 0, len(curve) - 1)
-    return curve[index.astype(np.int32)]
+    index = values * np.float32((len(curve) - 1) / top) + np.float32(0.5)
+    return curve.take(index.astype(np.int32), mode="clip")
 
 
 def band_curve(

@@ -26,6 +26,8 @@ RADIUS = 1
 """Frames looked at on either side; a second one brings a quarter of the gain of the first, for the same cost."""
 NOISE = 7.0
 """Difference in 8-bit levels, averaged over a few px, at which a neighbour stops being the same surface."""
+TRUST = np.exp(-((np.arange(256, dtype=np.float32) * np.float32(1.0 / NOISE)) ** 2))
+"""Weight of a neighbour for every such difference."""
 LONGEST_SIDE = 720
 """Larger frames are calmed at this size and corrected by the enlarged difference: their finest noise is removed by
 the styles' own smoothing, and the cost stays bounded."""
@@ -49,8 +51,8 @@ def calmed(window: Sequence[Frame], index: int) -> Frame:
     scale = min(1.0, LONGEST_SIDE / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     small = [resize(each, *size) for each in window]
-    change = _average(small, index) - small[index].astype(np.float32)
-    return np.clip(np.rint(frame + resize(change, width, height)), 0, 255).astype(np.uint8)
+    change = cv2.subtract(_average(small, index), small[index], dtype=cv2.CV_32F)
+    return cv2.add(frame, resize(change, width, height), dtype=cv2.CV_8U)  # rounds to nearest
 
 
 def _average(window: Sequence[Frame], index: int) -> Float[np.ndarray, "h w 3"]:
@@ -62,15 +64,18 @@ def _average(window: Sequence[Frame], index: int) -> Float[np.ndarray, "h w 3"]:
     for other, neighbour in enumerate(window):
         if other == index:
             continue
-        flow = resize(motion(half[index], half[other]), width, height)
-        flow *= np.array([width / half[index].shape[1], height / half[index].shape[0]], np.float32)
-        moved = sample(neighbour, pixel_grid(height, width) + flow)
+        flow = motion(half[index], half[other]) * _enlargement(half[index], width, height)
+        moved = sample(neighbour, pixel_grid(height, width) + resize(flow, width, height))
         difference = blur(cv2.cvtColor(cv2.absdiff(moved, window[index]), cv2.COLOR_RGB2GRAY), 2.0)
-        weight = np.exp(-((difference.astype(np.float32) * np.float32(1.0 / NOISE)) ** 2))
-        weight *= np.float32(1.0 / (1.0 + 0.25 * abs(other - index)))
+        weight = cv2.LUT(difference, TRUST * np.float32(1.0 / (1.0 + 0.25 * abs(other - index))))
         total += spread(weight, 3) * moved
         weights += weight
     return total / spread(weights, 3)
+
+
+def _enlargement(half: UInt8[np.ndarray, "h w"], width: int, height: int) -> Float[np.ndarray, " 2"]:
+    """Full-size px per px of the half-size picture, along x and y."""
+    return np.array([width / half.shape[1], height / half.shape[0]], np.float32)
 
 
 def _half_grey(frame: Frame) -> UInt8[np.ndarray, "h w"]:

@@ -81,11 +81,11 @@ class Toon:
         scale, size = filters.working_size(frame.shape, state["unit"], WORK_FACE_PX)
         lab = filters.to_lab(filters.resize(frame, *size))
         fields = _simplified(lab, points * scale, presence, state, state["unit"] * scale)
-        fields = filters.resize(fields, width, height)
+        *fields, response = (filters.resize(field, width, height) for field in fields)
         painted = _shaded(fields, state)
         if presence > 0:
             features.draw_toon_features(painted, frame, points, presence, state["unit"])
-        line = smoothstep(1.5, 3.6, fields[..., 4])
+        line = smoothstep(1.5, 3.6, response)
         rgb = filters.to_rgb(painted)
         rgb = filters.tint(rgb, INK, 0.86 * line)  # the rest of the colour shines through
         if presence > 0:
@@ -93,7 +93,7 @@ class Toon:
         return filters.to_bytes(rgb)
 
 
-def _simplified(lab: Lab, points: Points, presence: float, state: dict[str, Any], unit: float) -> np.ndarray:
+def _simplified(lab: Lab, points: Points, presence: float, state: dict[str, Any], unit: float) -> list[Plane]:
     """What shading and lines need, at working size: L, a, b, share of skin, ink response."""
     tangents, clarity = filters.structure(lab, 0.012 * unit)
     simple = filters.kuwahara(lab, tangents, clarity, 0.03 * unit)
@@ -109,15 +109,17 @@ def _simplified(lab: Lab, points: Points, presence: float, state: dict[str, Any]
     response = filters.ink_response(mix(simple[..., 0], lab[..., 0], 0.75), tangents, 0.008 * unit)
     if presence > 0:
         response *= 1.0 + np.float32(presence) * anatomy(lab.shape[:2], points, unit)
-    return np.dstack([simple, skin, response])
+    return [*cv2.split(simple), skin, response]
 
 
 def _skin(lab: Lab, colour: list[float], unit: float) -> Plane:
     """How much each place has the colour of the clip's skin and is not in the dark, 0..1."""
     near = blur(lab, 0.02 * unit)
-    away = near[..., 1:] - np.array(colour[1:], np.float32)
-    lit = smoothstep(0.35 * colour[0], 0.6 * colour[0] + 1.0, near[..., 0])
-    return np.exp(filters.dot(away, away) * np.float32(-0.5 / SKIN_SPREAD**2)) * lit
+    tone, a, b = cv2.split(near)
+    a -= np.float32(colour[1])
+    b -= np.float32(colour[2])
+    lit = smoothstep(0.35 * colour[0], 0.6 * colour[0] + 1.0, tone)
+    return np.exp((a * a + b * b) * np.float32(-0.5 / SKIN_SPREAD**2)) * lit
 
 
 def _smooth_skin(lab: Lab, amount: Plane, unit: float) -> Lab:
@@ -129,14 +131,14 @@ def _smooth_skin(lab: Lab, amount: Plane, unit: float) -> Lab:
     return cv2.merge([tone, lab[..., 1] * keep + wide[..., 0] * share, lab[..., 2] * keep + wide[..., 1] * share])
 
 
-def _shaded(fields: np.ndarray, state: dict[str, Any]) -> Lab:
+def _shaded(fields: list[Plane], state: dict[str, Any]) -> Lab:
     """Fields to Lab colour: tones gathered into bands, richer chroma, shadows leaning to violet."""
-    tone, skin = fields[..., 0], fields[..., 3]
+    tone, green_red, blue_yellow, skin = fields
     banded = mix(
         filters.curve_lookup(tone, state["tone_curve"]), filters.curve_lookup(tone, state["skin_curve"]), skin
     )
     shade = smoothstep(2.0, 24.0, np.float32(state["skin"][0]) - banded) * skin
     chroma = mix(np.full_like(tone, 1.22), state["chroma"], skin)
-    a = fields[..., 1] * chroma + 3.5 * shade
-    b = fields[..., 2] * chroma - 1.5 * shade + np.float32(state["warmth"]) * skin
+    a = green_red * chroma + 3.5 * shade
+    b = blue_yellow * chroma - 1.5 * shade + np.float32(state["warmth"]) * skin
     return cv2.merge([banded, a, b])
