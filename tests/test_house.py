@@ -21,7 +21,7 @@ SOURCE = ROOT / "src" / "toonifygb"
 MODULES = sorted(SOURCE.rglob("*.py"))
 
 FLOORS = {
-    0: ("structures", "errors", "progress"),
+    0: ("structures", "errors", "progress", "threads", "atomic"),
     1: ("geometry", "metrics", "assets", "config"),
     2: ("video", "face", "head", "stylize", "render"),
     3: ("avatar", "track", "synthetic"),

@@ -152,7 +152,7 @@ def test_unknown_backends_are_refused() -> None:
 
 
 def test_auto_says_what_it_chose(native: render.Renderer, caplog: pytest.LogCaptureFixture) -> None:
-    render._resolve.cache_clear()
+    render.resolve_backend.cache_clear()
     with caplog.at_level(logging.INFO, logger="toonifygb.render"):
         chosen = render.get("auto")
     assert chosen.name == native.name

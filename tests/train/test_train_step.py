@@ -18,7 +18,7 @@ from toonifygb.avatar.skinning import activate, scale_deltas
 from toonifygb.errors import InputError
 from toonifygb.progress import Stopped
 from toonifygb.structures import GaussianParams, TrackedSequence
-from toonifygb.train import Dataset, build_dataset, comparison, evaluate, first_avatar, train
+from toonifygb.train import Dataset, build_dataset, evaluate, first_avatar, train
 from toonifygb.train.densify import DensifyRules
 from toonifygb.train.losses import LossWeights, image_loss, mouth_loss
 from toonifygb.train.optim import DELTA_EPS, DELTA_RATES, FULL_STEPS, NEUTRAL_RATES, means_decay, settling
@@ -257,7 +257,4 @@ def test_scores_are_jsonable_and_complete(clip: tuple[Dataset, TrackedSequence])
     assert "psnr_pose_refined" not in plain
     assert abs(np.mean(scores["psnr_per_frame"]) - scores["psnr"]) < 1e-3
     assert abs(scores["psnr_per_channel"] - scores["psnr"]) < 1
-    picture = comparison(avatar, dataset, sequence, dataset.split.test[:2])
-    assert picture.shape == (2 * dataset.size, 3 * dataset.size, 3)
-    assert picture[:, : dataset.size].max() > 100
     assert activate(avatar.neutral).opacities.max() < 0.2

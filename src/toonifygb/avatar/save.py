@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +18,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
+from toonifygb.atomic import replacing
 from toonifygb.avatar.fields import cut_deltas, extended, last_changed
 from toonifygb.avatar.model import Avatar, PoseDrivers
 from toonifygb.errors import InputError
@@ -60,13 +60,10 @@ def save(avatar: Avatar, folder: Path | str, *, compact: bool = False) -> None:
     tensors = _apart(_tensors(_trimmed(avatar)))
     if compact:
         tensors = {n: t.half() if n.startswith("deltas.") else t for n, t in tensors.items()}
-    temporary = folder / f".{TENSORS}.{os.getpid()}"
-    save_file(tensors, temporary)
-    facts = _facts(avatar) | {"tensors_sha256": _digest(temporary), "compact": compact}
-    note = folder / f".{FACTS}.{os.getpid()}"
-    note.write_text(json.dumps(facts, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    temporary.replace(folder / TENSORS)
-    note.replace(folder / FACTS)
+    with replacing(folder / FACTS) as note, replacing(folder / TENSORS) as temporary:  # the last one comes first
+        save_file(tensors, temporary)
+        facts = _facts(avatar) | {"tensors_sha256": _digest(temporary), "compact": compact}
+        note.write_text(json.dumps(facts, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
 def load(folder: Path | str) -> Avatar:

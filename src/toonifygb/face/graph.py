@@ -11,7 +11,6 @@ writes these files; every function below whose name starts with ``_op_`` is one 
 from __future__ import annotations
 
 import json
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -20,9 +19,10 @@ from safetensors import safe_open
 from torch import nn
 
 from toonifygb.errors import AssetError
+from toonifygb.threads import one_torch_thread
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
     from jaxtyping import Float
@@ -64,7 +64,7 @@ class Graph(nn.Module):
     @torch.inference_mode()
     def forward(self, images: Float[Tensor, "n c h w"]) -> tuple[Tensor, ...]:
         """The outputs, in the order of the file, for a batch of inputs of the network's size."""
-        with _one_thread():
+        with one_torch_thread():
             return self._run(images)
 
     def _run(self, images: Float[Tensor, "n c h w"]) -> tuple[Tensor, ...]:
@@ -94,21 +94,6 @@ def load_graph(path: Path) -> Graph:
         if description is None:
             raise AssetError(f"{path} holds no network description", "reinstall toonifygb")
         return Graph(json.loads(description), {name: file.get_tensor(name) for name in file.keys()})
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Runs torch on one thread.
-
-    The layers are so small that threads wait for each other longer than they work: on a busy machine of two cores
-    the landmark network takes 43 ms of processor time with one thread and over 1000 ms with two.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _fast_layout(weight: Tensor) -> Tensor:

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
+from toonifygb.atomic import replacing
 from toonifygb.errors import InputError
 from toonifygb.structures import Landmarks
 
 
 def save_landmarks(landmarks: Landmarks, path: Path) -> None:
     """Writes landmarks so that the file is at no moment half there."""
-    temporary = path.with_name(f".{path.name}.part")
     # One entry: several would be written in an order that changes from process to process.
     size = {"size": json.dumps([landmarks.width, landmarks.height])}
     tensors = {"points": landmarks.points.contiguous(), "score": landmarks.score.contiguous()}
-    save_file(tensors, temporary, metadata=size)
-    os.replace(temporary, path)
+    with replacing(path) as temporary:
+        save_file(tensors, temporary, metadata=size)
 
 
 def load_landmarks(path: Path) -> Landmarks:

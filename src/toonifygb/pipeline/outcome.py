@@ -15,6 +15,7 @@ import torch
 
 from toonifygb import __version__, metrics, track, train, video
 from toonifygb import avatar as avatars
+from toonifygb.atomic import replacing
 from toonifygb.pipeline import pictures
 from toonifygb.pipeline.report import Curve, Picture, Report, render_report
 from toonifygb.pipeline.stages import peak_memory_mb, write_json
@@ -119,9 +120,8 @@ def write_report(source: Source, run: Run, config: RunConfig, scored: str, shown
     values = metrics_record(source, run, config, scores)
     write_json(run.file("metrics.json"), values)
     page = render_report(report_page(source, run, config, values))
-    temporary = run.file(".report.html.part")
-    temporary.write_text(page, encoding="utf-8")
-    temporary.replace(run.file("report.html"))
+    with replacing(run.file("report.html")) as temporary:
+        temporary.write_text(page, encoding="utf-8")
 
 
 def metrics_record(source: Source, run: Run, config: RunConfig, scores: dict[str, Any]) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from toonifygb import __version__
+from toonifygb.atomic import replacing
 from toonifygb.errors import InputError, ToonifyError
 
 if TYPE_CHECKING:
@@ -59,9 +60,8 @@ class Reporter(Protocol):
 
 def write_json(path: Path, value: Any) -> None:
     """Writes JSON so that the file is at no moment half there."""
-    temporary = path.with_name(f".{path.name}.part")
-    temporary.write_text(json.dumps(value, indent=1, sort_keys=True) + "\n")
-    os.replace(temporary, path)
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(value, indent=1, sort_keys=True) + "\n")
 
 
 def peak_memory_mb() -> float:

@@ -13,7 +13,7 @@ from toonifygb.render.base import DEFAULT_CONSTANTS, RasterConstants, Renderer, 
 if TYPE_CHECKING:
     from toonifygb.render.fused import Kernels
 
-__all__ = ["DEFAULT_CONSTANTS", "RasterConstants", "RenderInfo", "Renderer", "get", "kernels"]
+__all__ = ["DEFAULT_CONSTANTS", "RasterConstants", "RenderInfo", "Renderer", "get", "kernels", "resolve_backend"]
 
 log = logging.getLogger(__name__)
 
@@ -21,7 +21,7 @@ BACKENDS = ("auto", "native", "reference")
 
 
 @functools.cache
-def _resolve(backend: str) -> str:
+def resolve_backend(backend: str) -> str:
     """``native`` or ``reference`` for a backend's name; says once in the log what ``auto`` became and why."""
     if backend not in BACKENDS:
         raise InputError(f"backend is {backend!r}, expected one of {', '.join(BACKENDS)}", "use auto")
@@ -46,7 +46,7 @@ def get(backend: str = "auto", threads: int | None = None) -> Renderer:
         InputError: no such backend.
         BackendError: ``native`` was asked for and is not available.
     """
-    if _resolve(backend) == "native":
+    if resolve_backend(backend) == "native":
         from toonifygb.render.native import NativeRenderer
 
         return NativeRenderer(threads)
@@ -57,7 +57,7 @@ def get(backend: str = "auto", threads: int | None = None) -> Renderer:
 
 def kernels(backend: str = "auto", threads: int | None = None) -> Kernels:
     """Fused training kernels by name; arguments and errors as in ``get``."""
-    if _resolve(backend) == "native":
+    if resolve_backend(backend) == "native":
         from toonifygb.render.native_fused import NativeKernels
 
         return NativeKernels(threads)

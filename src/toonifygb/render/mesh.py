@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toonifygb.render import _resolve, library
+from toonifygb.render import library, resolve_backend
 from toonifygb.structures import Camera, Rendering, TensorRecord
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def rasterize_mesh(
     points = _homogeneous_pixels(vertices, camera)
     corners = np.ascontiguousarray(faces.detach().cpu().numpy(), np.int64)
     screen, source, corner_bary = _to_screen(points, corners, near)
-    if _resolve(backend) == "native":
+    if resolve_backend(backend) == "native":
         triangle, bary, depth = _rasterize_native(
             screen, camera.width, camera.height, threads or os.cpu_count() or 1
         )
@@ -144,7 +144,7 @@ def interpolated_means(
         backend: as in ``rasterize_mesh``.
         threads: as in ``rasterize_mesh``.
     """
-    if _resolve(backend) != "native":
+    if resolve_backend(backend) != "native":
         return box_downsample(interpolate(hits, faces, attributes), factor)
     average = library.load().tgb_mesh_means
     average.argtypes = [ctypes.c_void_p] * 4 + [ctypes.c_int] * 5 + [ctypes.c_void_p]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +10,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
+from toonifygb.atomic import replacing
 from toonifygb.errors import InputError
 from toonifygb.structures import Camera, HeadMotion, Landmarks, TrackedSequence
 
@@ -62,13 +61,8 @@ def save(sequence: TrackedSequence, path: Path | str) -> None:
         "landmarks_width": sequence.landmarks.width,
         "landmarks_height": sequence.landmarks.height,
     }
-    handle, temporary = tempfile.mkstemp(prefix=path.name, suffix=".part", dir=path.parent)
-    os.close(handle)
-    try:
+    with replacing(path) as temporary:
         save_file(tensors, temporary, metadata={"track": json.dumps(facts, sort_keys=True)})
-        os.replace(temporary, path)
-    finally:
-        Path(temporary).unlink(missing_ok=True)
 
 
 def load(path: Path | str) -> TrackedSequence:

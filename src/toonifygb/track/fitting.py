@@ -17,6 +17,7 @@ from toonifygb.errors import FaceError, InputError
 from toonifygb.geometry.cameras import tracked_camera
 from toonifygb.progress import SILENT, Progress
 from toonifygb.structures import TrackedSequence
+from toonifygb.threads import one_torch_thread
 from toonifygb.track import gaps
 from toonifygb.track.energy import LandmarkEnergy, Observation, make_prior, project
 from toonifygb.track.model import LandmarkModel, PoseState
@@ -72,15 +73,11 @@ def fit(
     """
     _check(landmarks, fps, focal_px)
     # Linear algebra rounds differently with the arrays' alignment and the number of threads. Copies made by torch
-    # are always aligned, and the matrices here are too small for more than one thread to pay.
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    # are always aligned.
+    with one_torch_thread():
         return _fit(
             landmarks.map(torch.clone), head.map(torch.clone), config, fps, source_sha256, focal_px, progress
         )
-    finally:
-        torch.set_num_threads(before)
 
 
 def _fit(

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from toonifygb.train.data import Dataset, build_dataset, crop, crop_boxes, load_dataset, split_frames
-from toonifygb.train.evaluate import comparison, evaluate
+from toonifygb.train.evaluate import evaluate
 from toonifygb.train.loop import first_avatar, train
 from toonifygb.train.refine import refine_poses
 
 __all__ = [
     "Dataset",
     "build_dataset",
-    "comparison",
     "crop",
     "crop_boxes",
     "evaluate",

@@ -8,7 +8,6 @@ follows the head smoothly; each frame's camera is cropped with it, so the world 
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +17,7 @@ import numpy as np
 import torch
 from numpy.lib.format import open_memmap
 
+from toonifygb.atomic import replacing
 from toonifygb.errors import InputError
 from toonifygb.geometry.cameras import crop_camera, project
 from toonifygb.progress import SILENT
@@ -124,9 +124,8 @@ def build_dataset(
         "train": list(split.train),
         "test": list(split.test),
     }
-    note = folder / f".{FACTS}.{os.getpid()}"
-    note.write_text(json.dumps(facts) + "\n", encoding="utf-8")
-    note.replace(folder / FACTS)
+    with replacing(folder / FACTS) as note:
+        note.write_text(json.dumps(facts) + "\n", encoding="utf-8")
     return load_dataset(folder)
 
 
@@ -232,25 +231,22 @@ def _write_crops(
     folder: Path,
     progress: Progress,
 ) -> None:
-    n = len(boxes)
-    temporary = {name: folder / f".{name}.{os.getpid()}" for name in (FRAMES, MATTES)}
-    frames = open_memmap(temporary[FRAMES], mode="w+", dtype=np.uint8, shape=(n, size, size, 3))
-    mattes = open_memmap(temporary[MATTES], mode="w+", dtype=np.uint8, shape=(n, size, size))
-    done = 0
-    for frame, matte in pairs:
-        if done == n:
-            break
-        frames[done] = crop(frame, boxes[done], size)
-        # Rounded before resizing: mattes are judged at 8 bits anyway and uint8 resizing is four times faster.
-        mattes[done] = crop(np.rint(matte * 255).astype(np.uint8), boxes[done], size)
-        done += 1
-        progress.update(done, n)
-    if done < n:
-        raise InputError(f"the clip ends after {done} frames but was tracked for {n}", "track the clip again")
-    frames.flush()
-    mattes.flush()
-    for name, path in temporary.items():
-        path.replace(folder / name)
+    n, done = len(boxes), 0
+    with replacing(folder / FRAMES) as frames_path, replacing(folder / MATTES) as mattes_path:
+        frames = open_memmap(frames_path, mode="w+", dtype=np.uint8, shape=(n, size, size, 3))
+        mattes = open_memmap(mattes_path, mode="w+", dtype=np.uint8, shape=(n, size, size))
+        for frame, matte in pairs:
+            if done == n:
+                break
+            frames[done] = crop(frame, boxes[done], size)
+            # Rounded before resizing: mattes are judged at 8 bits anyway and uint8 resizing is four times faster.
+            mattes[done] = crop(np.rint(matte * 255).astype(np.uint8), boxes[done], size)
+            done += 1
+            progress.update(done, n)
+        if done < n:
+            raise InputError(f"the clip ends after {done} frames but was tracked for {n}", "track the clip again")
+        frames.flush()
+        mattes.flush()
 
 
 def crop(image: UInt8[np.ndarray, "h w *c"], box: Int[np.ndarray, " 4"], size: int) -> UInt8[np.ndarray, "s s *c"]:

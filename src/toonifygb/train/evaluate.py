@@ -1,4 +1,4 @@
-"""How well an avatar reproduces frames: PSNR and SSIM on black, and pictures to look at."""
+"""How well an avatar reproduces frames: PSNR and SSIM on black."""
 
 from __future__ import annotations
 
@@ -16,15 +16,10 @@ from toonifygb.train.refine import refine_poses
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jaxtyping import Float, UInt8
-    from torch import Tensor
-
     from toonifygb.avatar import Avatar
     from toonifygb.progress import Progress
     from toonifygb.structures import TrackedSequence
     from toonifygb.train.data import Dataset
-
-_ERROR_GAIN = 4.0
 
 
 def evaluate(
@@ -87,28 +82,3 @@ def _scores(
             for name, measure in (("psnr", psnr), ("psnr_per_channel", psnr_per_channel), ("ssim", ssim)):
                 table[name].append(float(measure(image, target)))
     return table
-
-
-def comparison(
-    avatar: Avatar,
-    dataset: Dataset,
-    sequence: TrackedSequence,
-    frames: Sequence[int],
-    *,
-    backend: str = "auto",
-    threads: int | None = None,
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Picture grid, one row per frame: photo on black, render, four-fold absolute difference."""
-    renderer, poser = render.get(backend, threads), Poser(avatar, backend=backend, threads=threads)
-    rows = []
-    with torch.no_grad():
-        for index in frames:
-            target, _ = dataset.target(index)
-            image = renderer.render(poser(sequence.motion[index]), dataset.camera(index)).color.clamp(0, 1)
-            error = ((image - target).abs() * _ERROR_GAIN).clamp_max(1)
-            rows.append(torch.cat([target, image, error], dim=1))
-    return _to_uint8(torch.cat(rows))
-
-
-def _to_uint8(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    return (image * 255).round().to(torch.uint8).numpy()

@@ -10,9 +10,7 @@ import dataclasses
 import hashlib
 import json
 import logging
-import os
 import time
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,17 +18,17 @@ from typing import TYPE_CHECKING
 import torch
 
 from toonifygb import __version__, render
+from toonifygb.atomic import replacing
 from toonifygb.avatar import init_avatar
 from toonifygb.progress import SILENT, Stopped
 from toonifygb.render import RenderInfo
+from toonifygb.threads import one_torch_thread
 from toonifygb.train.densify import Densifier
 from toonifygb.train.state import TrainState, read_checkpoint, write_checkpoint
 from toonifygb.train.step import Stepper
 from toonifygb.train.views import TrainingViews
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from toonifygb.avatar import Avatar
     from toonifygb.config import TrainConfig
     from toonifygb.head import HeadModel
@@ -74,7 +72,7 @@ def train(
     """
     folder = Path(out_dir)
     folder.mkdir(parents=True, exist_ok=True)
-    with _one_torch_thread():
+    with one_torch_thread():
         template = first_avatar(dataset, sequence, head, config)
         state = _resumed(folder, config, dataset) or TrainState.start(template, config.seed)
         stepper = Stepper(
@@ -146,9 +144,8 @@ class _Journal:
         if path.is_file():
             lines = path.read_text(encoding="utf-8").splitlines()
             kept = [line for line in lines if _step_of(line) <= step]
-        temporary = path.with_name(f".{path.name}.{os.getpid()}")
-        temporary.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
-        temporary.replace(path)
+        with replacing(path) as temporary:
+            temporary.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
 
     def note(self, step: int, terms: LossTerms, stepper: Stepper) -> dict[str, float]:
         """Remembers a step, writes a line when one is due, and gives the figures worth showing."""
@@ -209,14 +206,3 @@ def _with_facts(avatar: Avatar, sequence: TrackedSequence, dataset: Dataset, con
         "source_sha256": sequence.source_sha256,
     }
     return replace(avatar, meta=avatar.meta | facts)
-
-
-@contextmanager
-def _one_torch_thread() -> Iterator[None]:
-    """One thread for torch: the engine has its own, and two pools on the same cores slow each other many times."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

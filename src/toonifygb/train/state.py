@@ -8,7 +8,6 @@ the pose (both face groups) each belong to a prefix of every field, and blending
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +15,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
+from toonifygb.atomic import replacing
 from toonifygb.avatar.fields import cut, cut_deltas, extended, join
 from toonifygb.avatar.transfer import consistency
 from toonifygb.errors import InputError
@@ -170,9 +170,8 @@ def write_checkpoint(state: TrainState, path: Path, facts: dict[str, Any]) -> No
         "position": state.position,
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    save_file({n: t.contiguous() for n, t in tensors.items()}, temporary, metadata={"state": json.dumps(notes)})
-    temporary.replace(path)
+    with replacing(path) as temporary:
+        save_file({n: t.contiguous() for n, t in tensors.items()}, temporary, metadata={"state": json.dumps(notes)})
 
 
 def read_checkpoint(path: Path) -> tuple[TrainState, dict[str, Any]]:

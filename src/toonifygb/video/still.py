@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from toonifygb.atomic import replacing
 from toonifygb.errors import InputError
 from toonifygb.video.pixels import flatten_alpha
 
@@ -54,12 +55,10 @@ def save_png(path: str | os.PathLike[str], image: UInt8[np.ndarray, "h w 3"]) ->
     """
     path = Path(path)
     _, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-    part = path.with_name(f"{path.stem}.part{path.suffix}")
     try:
-        part.write_bytes(data.tobytes())
-        os.replace(part, path)
+        with replacing(path) as temporary:
+            temporary.write_bytes(data.tobytes())
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise InputError(f"image {path} cannot be written: {error.strerror}", "choose another place") from error
 
 
