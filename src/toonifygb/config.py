@@ -52,6 +52,8 @@ class TrackConfig:
     """Identity coefficients fitted."""
     iterations: int = 25
     """Levenberg-Marquardt iterations at most."""
+    photometric: bool = True
+    """Fit the head's pose in every frame to the pixels as well, after the landmarks."""
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,14 @@ def fitted(landmarks: Landmarks, **options: float | None) -> TrackedSequence:
 
 
 def rotation_error_deg(fit: TrackedSequence, truth: TrackedSequence) -> torch.Tensor:
-    turn = axis_angle_to_matrix(fit.motion.joints[:, 0]).mT @ axis_angle_to_matrix(truth.motion.joints[:, 0])
-    return torch.rad2deg(matrix_to_axis_angle(turn).norm(dim=-1))
+    ours, true = (_head_turn(sequence) for sequence in (fit, truth))
+    return torch.rad2deg(matrix_to_axis_angle(ours.mT @ true).norm(dim=-1))
+
+
+def _head_turn(sequence: TrackedSequence) -> torch.Tensor:
+    """Head to world: the root's turn, then the neck's."""
+    turns = axis_angle_to_matrix(sequence.motion.joints[:, :2])
+    return turns[:, 0] @ turns[:, 1]
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from toonifygb import avatar as avatars
 from toonifygb import face, head, stylize, track, train, video
 from toonifygb.config import from_json, to_json
 from toonifygb.errors import FaceError, InputError
-from toonifygb.pipeline.files import load_landmarks, save_landmarks
+from toonifygb.pipeline.files import LANDMARK_TRACK, load_landmarks, save_landmarks
 from toonifygb.pipeline.outcome import outcome
 from toonifygb.pipeline.source import Source
 from toonifygb.pipeline.stages import STATE_FILE
@@ -44,21 +44,25 @@ def create(source: Source, run: Run, config: RunConfig) -> None:
         Stopped: the user asked to stop; calling again goes on.
     """
     remember_request(source, run, config)
-    tracked, styled = track_stages(source, run, config)
+    fitted, styled = track_stages(source, run, config)
     check_trainable(run, source)
-    cut = cut_dataset(source, run, config, tracked, styled)
+    cut = cut_dataset(source, run, config, fitted, styled)
+    tracked = finish_track(run, config, fitted, cut)
+    draw_overlay(source, run, tracked, styled)
     trained = train_avatar(run, config, cut, tracked)
     outcome(source, run, config, trained)
 
 
 def track_only(source: Source, run: Run, config: RunConfig) -> None:
-    """Runs the stages up to the track and its overlay."""
+    """Runs the stages up to the track and its overlay; the pixels are left out, as they need an avatar."""
     remember_request(source, run, config)
-    track_stages(source, run, config)
+    fitted, styled = track_stages(source, run, config)
+    tracked = finish_track(run, config, fitted, None)
+    draw_overlay(source, run, tracked, styled)
 
 
 def track_stages(source: Source, run: Run, config: RunConfig) -> tuple[str, str]:
-    """Fingerprints of the track and of the stylised video it stands beside."""
+    """Fingerprints of the landmark track and of the stylised video it stands beside."""
     found = find_landmarks(source, run, config)
     styled = stylize_clip(source, run, config, found)
     chosen = choose_landmarks(run, config, found, styled)
@@ -193,34 +197,62 @@ def _compare_landmarks(
 
 
 def fit_track(source: Source, run: Run, config: RunConfig, chosen: str) -> str:
-    """The head model fitted to the landmarks, and the overlay that shows how well."""
-    out, overlay_path = run.file("track.safetensors"), run.file("overlay.mp4")
+    """The head model fitted to the landmarks."""
+    out = run.work(LANDMARK_TRACK)
 
     def work(progress: Progress) -> None:
-        landmarks = load_landmarks(run.work("landmarks_chosen.safetensors"))
-        model = head.load("open")
         sequence = track.fit(
-            landmarks,
-            model,
+            load_landmarks(run.work("landmarks_chosen.safetensors")),
+            head.load("open"),
             config.track,
             fps=source.info.fps,
             source_sha256=source.sha256,
             progress=progress,
         )
         run.problems("track", list(track.report(sequence).problems))
-        overlay = track.Overlay(sequence, model)
-        with video.Writer(
-            overlay_path, source.info.width, source.info.height, source.info.fps, audio_from=source.path
-        ) as writer:
-            for index, frame in enumerate(video.read(run.file("stylized.mp4"), max_frames=sequence.n_frames)):
-                cropped = frame[: source.info.height, : source.info.width]
-                writer.write(overlay(cropped, index))
-                progress.update(index + 1, sequence.n_frames)
         track.save(sequence, out)
 
-    return run.stage(
-        "track", "tracking the head", inputs=[chosen, config.track], outputs=[out, overlay_path], work=work
-    )
+    settings = {"n_shape": config.track.n_shape, "iterations": config.track.iterations}
+    return run.stage("track", "tracking the head", inputs=[chosen, settings], outputs=[out], work=work)
+
+
+def finish_track(run: Run, config: RunConfig, fitted: str, cut: str | None) -> str:
+    """The final track: head poses fitted to the pixels of the crops, or as the landmarks have them."""
+    out = run.file("track.safetensors")
+    dataset = cut if config.track.photometric else None
+
+    def work(progress: Progress) -> None:
+        sequence = track.load(run.work(LANDMARK_TRACK))
+        if dataset is not None:
+            sequence = train.refine_track(
+                train.load_dataset(run.work("dataset")),
+                sequence,
+                head.load("open"),
+                seed=config.train.seed,
+                backend=config.backend,
+                threads=config.threads,
+                progress=progress,
+            )
+        track.save(sequence, out)
+
+    title = "keeping the track" if dataset is None else "refining the track"
+    return run.stage("refine", title, inputs=[fitted, dataset, config.train.seed], outputs=[out], work=work)
+
+
+def draw_overlay(source: Source, run: Run, tracked: str, styled: str) -> None:
+    """The head model drawn on the clip: how well it is tracked."""
+    out = run.file("overlay.mp4")
+
+    def work(progress: Progress) -> None:
+        info, sequence = source.info, track.load(run.file("track.safetensors"))
+        draw = track.Overlay(sequence, head.load("open"))
+        films = video.read(run.file("stylized.mp4"), max_frames=sequence.n_frames)
+        with video.Writer(out, info.width, info.height, info.fps, audio_from=source.path) as writer:
+            for index, frame in enumerate(films):
+                writer.write(draw(frame[: info.height, : info.width], index))
+                progress.update(index + 1, sequence.n_frames)
+
+    run.stage("overlay", "drawing the overlay", inputs=[tracked, styled], outputs=[out], work=work)
 
 
 def check_trainable(run: Run, source: Source) -> None:
@@ -229,7 +261,7 @@ def check_trainable(run: Run, source: Source) -> None:
     Raises:
         InputError: fewer than ``MIN_FRAMES`` tracked frames.
     """
-    usable = int(track.load(run.file("track.safetensors")).tracked.sum())
+    usable = int(track.load(run.work(LANDMARK_TRACK)).tracked.sum())
     if usable < MIN_FRAMES:
         raise InputError(
             f"{source.path.name} has {usable} usable frame{'' if usable == 1 else 's'}; an avatar needs at least "
@@ -238,12 +270,12 @@ def check_trainable(run: Run, source: Source) -> None:
         )
 
 
-def cut_dataset(source: Source, run: Run, config: RunConfig, tracked: str, styled: str) -> str:
+def cut_dataset(source: Source, run: Run, config: RunConfig, fitted: str, styled: str) -> str:
     """The square head crops and mattes that Stage 2 is trained on."""
     out = run.work("dataset")
 
     def work(progress: Progress) -> None:
-        sequence = track.load(run.file("track.safetensors"))
+        sequence = track.load(run.work(LANDMARK_TRACK))
         model = head.load("open")
         frames = (f[: source.info.height, : source.info.width] for f in video.read(run.file("stylized.mp4")))
         landmarks = load_landmarks(run.work("landmarks.safetensors"))
@@ -257,7 +289,7 @@ def cut_dataset(source: Source, run: Run, config: RunConfig, tracked: str, style
     return run.stage(
         "dataset",
         "cutting out the head",
-        inputs=[tracked, styled, settings],
+        inputs=[fitted, styled, settings],
         outputs=[out],
         work=work,
     )

@@ -12,6 +12,9 @@ from toonifygb.atomic import replacing
 from toonifygb.errors import InputError
 from toonifygb.structures import Landmarks
 
+LANDMARK_TRACK = "landmark_track.safetensors"
+"""Work file: the track before the pixels had their say."""
+
 
 def save_landmarks(landmarks: Landmarks, path: Path) -> None:
     """Writes landmarks so that the file is at no moment half there."""

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from toonifygb import __version__, metrics, track, train, video
+from toonifygb import __version__, head, metrics, track, train, video
 from toonifygb import avatar as avatars
 from toonifygb.atomic import replacing
 from toonifygb.pipeline import pictures
+from toonifygb.pipeline.files import LANDMARK_TRACK
 from toonifygb.pipeline.report import Curve, Picture, Report, render_report
 from toonifygb.pipeline.stages import peak_memory_mb, write_json
 from toonifygb.pipeline.viewing import AvatarViewer, posed
@@ -58,15 +59,13 @@ def score(source: Source, run: Run, config: RunConfig, trained: str) -> str:
     def work(progress: Progress) -> None:
         dataset = train.load_dataset(run.work("dataset"))
         sequence = track.load(run.file("track.safetensors"))
-        held_out = train.evaluate(
-            avatars.load(run.file("avatar")),
-            dataset,
-            sequence,
-            dataset.split.test,
-            backend=config.backend,
-            threads=config.threads,
-            progress=progress,
-        )
+        model, engine = avatars.load(run.file("avatar")), {"backend": config.backend, "threads": config.threads}
+        held_out = train.evaluate(model, dataset, sequence, dataset.split.test, **engine, progress=progress)
+        by_landmarks = track.load(run.work(LANDMARK_TRACK))
+        driven = train.evaluate(model, dataset, by_landmarks, dataset.split.test, **engine)
+        held_out |= {f"{name}_landmark_pose": driven[name] for name in ("psnr", "ssim")}
+        refined_error = track.landmark_errors(sequence, head.load(sequence.head_model))
+        held_out["landmark_error_refined_px"] = float(refined_error[sequence.tracked].mean())
         steadiness = metrics.stability(video.read(run.file("stylized.mp4")))
         write_json(out, {**held_out, "itf": steadiness.itf, "isi": steadiness.isi})
 
@@ -216,7 +215,7 @@ def report_page(source: Source, run: Run, config: RunConfig, values: dict[str, A
         ("frames", f"{values['n_frames']} ({values['n_train']} trained on, {values['n_test']} held out)"),
         ("crop", f"{values['resolution']} px square"),
         ("tracked video", values["track_on"]),
-        ("PSNR with head pose fitted to each picture", f"{values['psnr_pose_refined']:.2f} dB"),
+        ("PSNR with the head pose of the landmarks alone", f"{values['psnr_landmark_pose']:.2f} dB"),
         ("ISI", f"{values['isi']:.4f}"),
         ("peak memory", f"{values['peak_memory_mb']:.0f} MB"),
         *((name, str(version)) for name, version in values["versions"].items()),

@@ -2,7 +2,7 @@
 
 from toonifygb.track import overlay
 from toonifygb.track.files import load, save
-from toonifygb.track.fitting import fit
+from toonifygb.track.fitting import fit, landmark_errors
 from toonifygb.track.overlay import Overlay
 from toonifygb.track.regions import Boxes, HeadRegion, head_boxes, head_region
 from toonifygb.track.source import Choice, choose_source
@@ -19,6 +19,7 @@ __all__ = [
     "head_boxes",
     "head_region",
     "jitter_px",
+    "landmark_errors",
     "load",
     "overlay",
     "report",

@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING
 import torch
 
 from toonifygb.errors import FaceError, InputError
-from toonifygb.geometry.cameras import tracked_camera
+from toonifygb.geometry import cameras
 from toonifygb.progress import SILENT, Progress
 from toonifygb.structures import TrackedSequence
 from toonifygb.threads import one_torch_thread
 from toonifygb.track import gaps
 from toonifygb.track.energy import LandmarkEnergy, Observation, make_prior, project
 from toonifygb.track.model import LandmarkModel, PoseState
+from toonifygb.track.neck import on_a_neck
 from toonifygb.track.solve import FocalBelief, Shared, make_acceleration, solve_identity, solve_motion
 from toonifygb.track.start import diverse_frames, face_size, initial_poses
 
@@ -105,11 +106,13 @@ def _fit(
     n_frames = landmarks.points.shape[0]
     tracked = torch.zeros(n_frames, dtype=torch.bool).index_fill_(0, frames, True)
     errors = torch.full((n_frames,), torch.nan).index_copy_(0, frames, error)
+    shape = torch.nn.functional.pad(shared.shape, (0, head.n_shape - shared.shape.shape[0]))
+    motion = gaps.bridged(person.to_motion(shared.shape[:0], state), frames, n_frames)
     return TrackedSequence(
         head_model=head.name,
-        shape=torch.nn.functional.pad(shared.shape, (0, head.n_shape - shared.shape.shape[0])),
-        motion=gaps.bridged(person.to_motion(shared.shape[:0], state), frames, n_frames),
-        camera=tracked_camera(float(shared.log_focal.exp()), landmarks.width, landmarks.height),
+        shape=shape,
+        motion=on_a_neck(motion, head, shape),
+        camera=cameras.tracked_camera(float(shared.log_focal.exp()), landmarks.width, landmarks.height),
         landmarks=landmarks,
         tracked=tracked,
         error_px=errors,
@@ -149,6 +152,20 @@ def expected_focal(width: int, height: int, face_px: float) -> float:
     by_sensor = 1.1 * max(width, height)
     by_distance = 0.7 / FACE_HEIGHT * face_px
     return math.sqrt(by_sensor * by_distance)
+
+
+def landmark_errors(sequence: TrackedSequence, head: HeadModel) -> Float[Tensor, " t"]:
+    """Mean distance of the head's landmarks from the detected ones in each frame, px with the face scaled to
+    ``ERROR_FACE_PX``; NaN where none were detected.
+
+    Args:
+        sequence: a track, whatever became of its motion since it was fitted.
+        head: its head model.
+    """
+    points, _ = head.landmarks().forward(sequence.shape, sequence.motion)
+    found = sequence.landmarks.points
+    off = (cameras.project(sequence.camera, points)[0] - found).norm(dim=-1).mean(-1)
+    return off * ERROR_FACE_PX / face_size(found)
 
 
 class _Clip:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from toonifygb.train.data import Dataset, build_dataset, crop, crop_boxes, load_dataset, split_frames
 from toonifygb.train.evaluate import evaluate
 from toonifygb.train.loop import first_avatar, train
-from toonifygb.train.refine import refine_poses
+from toonifygb.train.photometric import refine_track
 
 __all__ = [
     "Dataset",
@@ -15,7 +15,7 @@ __all__ = [
     "evaluate",
     "first_avatar",
     "load_dataset",
-    "refine_poses",
+    "refine_track",
     "split_frames",
     "train",
 ]

@@ -8,7 +8,7 @@ follows the head smoothly; each frame's camera is cropped with it, so the world 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +38,7 @@ FORMAT = "toonifygb-dataset"
 FRAMES, MATTES, FACTS = "frames.npy", "mattes.npy", "dataset.json"
 _HAIR_MARGIN = 0.12
 """Room above the bald mesh for hair, and half of it on either side, in units of the mesh's height."""
+_WIDEN = 1.25
 _FOLLOW_SECONDS = 0.6
 """Standard deviation of the smoothing of a moving crop box."""
 _LOOK_EVERY = 5
@@ -59,6 +60,8 @@ class Dataset:
     split: Split
     fingerprint: str
     """Changes with everything the crops depend on."""
+    reduction: int = 1
+    """Targets are smaller than the stored crops by this whole factor."""
 
     @property
     def n_frames(self) -> int:
@@ -67,8 +70,12 @@ class Dataset:
 
     @property
     def size(self) -> int:
-        """Side of a crop, px."""
-        return self.frames.shape[1]
+        """Side of a target, px."""
+        return self.frames.shape[1] // self.reduction
+
+    def reduced(self, factor: int) -> Dataset:
+        """The same frames seen smaller by a whole factor that divides their size; nothing is copied."""
+        return replace(self, reduction=self.reduction * factor)
 
     def camera(self, index: int) -> Camera:
         """Camera of one crop."""
@@ -78,8 +85,12 @@ class Dataset:
     def target(self, index: int) -> tuple[Float[Tensor, "s s 3"], Float[Tensor, "s s"]]:
         """What a render of this frame should be: colour × matte on black, 0..1, and the matte."""
         matte = torch.from_numpy(self.mattes[index].astype(np.float32)).div_(255)
-        color = torch.from_numpy(self.frames[index].astype(np.float32)).div_(255)
-        return color.mul_(matte[..., None]), matte
+        color = torch.from_numpy(self.frames[index].astype(np.float32)).div_(255).mul_(matte[..., None])
+        if self.reduction == 1:
+            return color, matte
+        small = (self.size, self.size)
+        pooled = (cv2.resize(image.numpy(), small, interpolation=cv2.INTER_AREA) for image in (color, matte))
+        return torch.from_numpy(next(pooled)), torch.from_numpy(next(pooled))
 
 
 def build_dataset(
@@ -109,7 +120,7 @@ def build_dataset(
     if (folder / FACTS).is_file() and _read_facts(folder).get("fingerprint") == wanted:
         return load_dataset(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    boxes = crop_boxes(sequence, head, config.crop_scale)
+    boxes = crop_boxes(sequence, head, config.crop_scale, config.resolution)
     _write_crops(pairs, boxes, config.resolution, folder, progress)
     split = split_frames(sequence, config)
     facts = {
@@ -174,18 +185,23 @@ def split_frames(sequence: TrackedSequence, config: TrainConfig) -> Split:
     )
 
 
-def crop_boxes(sequence: TrackedSequence, head: HeadModel, crop_scale: float) -> Int[np.ndarray, "t 4"]:
+def crop_boxes(
+    sequence: TrackedSequence, head: HeadModel, crop_scale: float, resolution: int = 1
+) -> Int[np.ndarray, "t 4"]:
     """Square crop of every frame, px of the full frame, all of one size and inside the frame.
 
-    The side is ``crop_scale`` face boxes. Where the mesh with room for hair stays within one such box over the
-    whole clip, that box is used for every frame; else the box follows the mesh smoothly.
+    The side is ``crop_scale`` face boxes, or up to ``_WIDEN`` times that where this saves magnifying the picture to
+    ``resolution`` px: invented pixels cost as much to train on as filmed ones. Where the mesh with room for hair
+    stays within one such box over the whole clip, that box is used for every frame; else the box follows the mesh
+    smoothly.
     """
     width, height = sequence.camera.width, sequence.camera.height
     points = sequence.landmarks.points[sequence.tracked & sequence.landmarks.valid]
     if len(points) == 0:
         raise InputError("the track has no frame with a face", "choose a clip that shows a face")
     extent = (points.amax(1) - points.amin(1)).amax(-1)
-    side = min(round(float(extent.median()) * crop_scale), width, height)
+    wanted = round(float(extent.median()) * crop_scale)
+    side = min(max(wanted, min(resolution, int(_WIDEN * wanted))), width, height)
     bounds = _head_bounds(sequence, head)
     union = np.concatenate([bounds[:, :2].min(0), bounds[:, 2:].max(0)])
     if max(union[2] - union[0], union[3] - union[1]) <= side:

@@ -11,7 +11,6 @@ from toonifygb import render
 from toonifygb.avatar import Poser
 from toonifygb.metrics import psnr, psnr_per_channel, ssim
 from toonifygb.progress import SILENT
-from toonifygb.train.refine import refine_poses
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,7 +27,6 @@ def evaluate(
     sequence: TrackedSequence,
     frames: Sequence[int],
     *,
-    refine: bool = True,
     backend: str = "auto",
     threads: int | None = None,
     progress: Progress = SILENT,
@@ -37,48 +35,25 @@ def evaluate(
 
     Protocol: render clamped to 0..1 against photo × matte on black, float, the whole training crop. ``psnr`` takes
     one mean over all channels, ``psnr_per_channel`` is 3DGB's variant; every score is the mean over the frames.
-    The motion is the landmark track's: nothing of a held-out picture beyond its landmarks is known. With
-    ``refine`` the scores after the rigid head pose of each frame (six numbers) was fitted to its pixels against the
-    finished avatar, as photometric trackers do, are reported as well, under ``…_pose_refined``.
 
     Args:
         avatar: what is judged.
         dataset: its training set, which also holds the held-out frames.
         sequence: the motion of every frame.
         frames: which to judge.
-        refine: whether to add the scores with fitted head poses.
         backend: rasteriser.
         threads: of the native engine.
         progress: told after every frame.
     """
-    engine = {"backend": backend, "threads": threads}
-    tables = {"": _scores(avatar, dataset, sequence, frames, **engine)}
-    if refine:
-        refined = refine_poses(avatar, dataset, sequence, frames, **engine, progress=progress)
-        tables["_pose_refined"] = _scores(avatar, dataset, refined, frames, **engine)
-    scores: dict[str, Any] = {"lpips": None, "frames": [int(index) for index in frames]}
-    for suffix, table in tables.items():
-        for name, values in table.items():
-            scores[f"{name}{suffix}"] = float(np.mean(values)) if values else None
-    return scores | {f"{name}_per_frame": [round(value, 4) for value in tables[""][name]] for name in tables[""]}
-
-
-def _scores(
-    avatar: Avatar,
-    dataset: Dataset,
-    sequence: TrackedSequence,
-    frames: Sequence[int],
-    *,
-    backend: str,
-    threads: int | None,
-) -> dict[str, list[float]]:
-    """Every score of every frame."""
     renderer, poser = render.get(backend, threads), Poser(avatar, backend=backend, threads=threads)
     table: dict[str, list[float]] = {"psnr": [], "psnr_per_channel": [], "ssim": []}
     with torch.no_grad():
-        for index in frames:
+        for done, index in enumerate(frames, start=1):
             target, _ = dataset.target(index)
             image = renderer.render(poser(sequence.motion[index]), dataset.camera(index)).color.clamp(0, 1)
             for name, measure in (("psnr", psnr), ("psnr_per_channel", psnr_per_channel), ("ssim", ssim)):
                 table[name].append(float(measure(image, target)))
-    return table
+            progress.update(done, len(frames))
+    scores: dict[str, Any] = {"lpips": None, "frames": [int(index) for index in frames]}
+    scores |= {name: float(np.mean(values)) if values else None for name, values in table.items()}
+    return scores | {f"{name}_per_frame": [round(value, 4) for value in table[name]] for name in table}

@@ -74,7 +74,8 @@ def train(
     folder.mkdir(parents=True, exist_ok=True)
     with one_torch_thread():
         template = first_avatar(dataset, sequence, head, config)
-        state = _resumed(folder, config, dataset) or TrainState.start(template, config.seed)
+        facts = {"fingerprint": _fingerprint(config, dataset, sequence)}
+        state = _resumed(folder, facts) or TrainState.start(template, config.seed)
         stepper = Stepper(
             state,
             template,
@@ -84,7 +85,7 @@ def train(
             render.get(backend, threads),
             render.kernels(backend, threads),
         )
-        _run(stepper, folder, config, dataset, progress)
+        _run(stepper, folder, config, facts, progress)
         return _with_facts(state.avatar(template), sequence, dataset, config)
 
 
@@ -102,9 +103,9 @@ def first_avatar(dataset: Dataset, sequence: TrackedSequence, head: HeadModel, c
     )
 
 
-def _run(stepper: Stepper, folder: Path, config: TrainConfig, dataset: Dataset, progress: Progress) -> None:
-    """All remaining steps."""
-    state, facts = stepper.state, {"fingerprint": _fingerprint(config, dataset)}
+def _run(stepper: Stepper, folder: Path, config: TrainConfig, facts: dict[str, str], progress: Progress) -> None:
+    """All remaining steps; ``facts`` go into every checkpoint."""
+    state = stepper.state
     densifier = Densifier(stepper.first_counts, config.steps) if config.densify else None
     journal, saved = _Journal(folder / METRICS, state.step), time.monotonic()
     try:
@@ -178,23 +179,26 @@ def _step_of(line: str) -> float:
         return float("inf")
 
 
-def _resumed(folder: Path, config: TrainConfig, dataset: Dataset) -> TrainState | None:
+def _resumed(folder: Path, wanted: dict[str, str]) -> TrainState | None:
     path = folder / CHECKPOINT
     if not path.is_file():
         return None
     state, facts = read_checkpoint(path)
-    if facts.get("fingerprint") != _fingerprint(config, dataset):
+    if facts.get("fingerprint") != wanted["fingerprint"]:
         log.info("checkpoint %s belongs to another training; starting anew", path)
         return None
-    log.info("going on from step %d of %d", state.step, config.steps)
+    log.info("going on from step %d", state.step)
     return state
 
 
-def _fingerprint(config: TrainConfig, dataset: Dataset) -> str:
+def _fingerprint(config: TrainConfig, dataset: Dataset, sequence: TrackedSequence) -> str:
     """What a training depends on; a checkpoint of another one is not continued."""
     settings = dataclasses.asdict(replace(config, checkpoint_seconds=0.0))
-    parts = [json.dumps(settings, sort_keys=True), dataset.fingerprint]
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+    digest = hashlib.sha256(f"{json.dumps(settings, sort_keys=True)}\n{dataset.fingerprint}".encode())
+    motion = sequence.motion
+    for tensor in (sequence.shape, motion.expression, motion.joints, motion.translation, motion.eyelids):
+        digest.update(tensor.contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def _with_facts(avatar: Avatar, sequence: TrackedSequence, dataset: Dataset, config: TrainConfig) -> Avatar:

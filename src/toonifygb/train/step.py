@@ -62,14 +62,20 @@ class Stepper:
         self._renderer = renderer
         self._kernels = kernels
         self._weights = LossWeights.of(config)
+        self._template = template
         self._mouth = MouthVolume.around(join([template.mouth_upper, template.mouth_lower]).means)
+        self.follow(sequence)
+        self.rebind()
+
+    def follow(self, sequence: TrackedSequence) -> None:
+        """Takes the motion of every frame from a track."""
+        template = self._template
         self._transforms = template.transforms(sequence.motion)
         self._features = template.pose_feature(sequence.motion)
         psi = template.coefficients(sequence.motion)
         n_expression = template.n_expressions + template.n_eyelids
         self._expression = psi[:, :n_expression].contiguous()
         self._driver = psi[:, n_expression:].contiguous()
-        self.rebind()
 
     def rebind(self) -> None:
         """Prepares again what depends on the set of Gaussians; after densification."""
@@ -85,17 +91,26 @@ class Stepper:
         state = self.state
         index = state.next_frame(self._dataset.split.train)
         state.step += 1
-        psi = Coefficients(self._expression[index], self._driver[index])
-        gradient, terms = self._gradient(index, psi, info)
-        self._optimizer.step(state, gradient, psi)
+        gradient, terms = self._gradient(index, info)
+        self._optimizer.step(state, gradient, self._coefficients(index))
         return terms
 
-    def _gradient(self, index: int, psi: Coefficients, info: RenderInfo | None) -> tuple[GaussianParams, LossTerms]:
-        """Gradient of the whole objective for the blended raw parameters of one frame."""
-        raw = blend(self.state, psi, self._kernels)
+    def splats(self, index: int) -> Splats:
+        """All Gaussians as they stand now, in the pose of one frame, world space."""
+        return self._posed(index)[1]
+
+    def _coefficients(self, index: int) -> Coefficients:
+        return Coefficients(self._expression[index], self._driver[index])
+
+    def _posed(self, index: int) -> tuple[GaussianParams, Splats]:
+        """Blended raw parameters of one frame, and the splats they become."""
+        raw = blend(self.state, self._coefficients(index), self._kernels)
         raw.means[: self.state.counts.face].add_(pose_offsets(self._features[index], self.state.pose_basis))
-        binding = (self.state.skin_weights, self._transforms[index])
-        splats = self._kernels.skin(raw, *binding)
+        return raw, self._kernels.skin(raw, self.state.skin_weights, self._transforms[index])
+
+    def _gradient(self, index: int, info: RenderInfo | None) -> tuple[GaussianParams, LossTerms]:
+        """Gradient of the whole objective for the blended raw parameters of one frame."""
+        raw, splats = self._posed(index)
         leaves = _leaves(splats)
         cut_off = Splats(*leaves, sh_frames=splats.sh_frames)
         camera = self._dataset.camera(index)
@@ -103,6 +118,7 @@ class Stepper:
         target, matte = self._dataset.target(index)
         photo, alpha, v_color, v_alpha = image_gradients(rendering, target, matte, self._weights, self._kernels)
         found = torch.autograd.grad([rendering.color, rendering.alpha], leaves, [v_color, v_alpha])
+        binding = (self.state.skin_weights, self._transforms[index])
         gradient = self._kernels.skin_gradient(raw, *binding, Splats(*found))
         return gradient, LossTerms(photo, alpha, self._add_mouth_gradient(gradient))
 

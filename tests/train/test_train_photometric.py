@@ -1,0 +1,131 @@
+"""Photometric tracking finds head poses it knows by pixels alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+import torch
+from make import TINY, tiny_avatar, tiny_head, tiny_sequence
+
+from toonifygb import render
+from toonifygb.avatar import Avatar
+from toonifygb.geometry.rotations import matrix_to_axis_angle
+from toonifygb.structures import TrackedSequence
+from toonifygb.train import Dataset, build_dataset, photometric, refine_track
+from toonifygb.train.photometric import _Poses, carried
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from torch import Tensor
+
+N = 24
+SIZE = 96
+
+
+def opaque_avatar() -> Avatar:
+    """Without pose-driven deltas: a rigid motion then moves exactly the picture it should."""
+    avatar = tiny_avatar(n=400, seed=7)
+    return replace(
+        avatar,
+        drivers=None,
+        blendshape_names=avatar.blendshape_names[:6],
+        deltas=avatar.deltas.map(lambda delta: delta[:6]),
+        neutral=replace(avatar.neutral, opacity_logits=avatar.neutral.opacity_logits + 2),
+    )
+
+
+def filmed(avatar: Avatar, sequence: TrackedSequence, folder: Path) -> Dataset:
+    def pairs():
+        with torch.no_grad():
+            for index in range(sequence.n_frames):
+                image = render.get("auto", 1).render(avatar.pose(sequence.motion[index]), sequence.camera)
+                color = image.color / image.alpha.clamp_min(1e-3)[..., None]
+                yield (color.clamp(0, 1) * 255).round().to(torch.uint8).numpy(), image.alpha.clamp(0, 1).numpy()
+
+    config = replace(TINY, crop_scale=5.0, resolution=SIZE)
+    return build_dataset(pairs(), sequence, tiny_head(), config, folder)
+
+
+def shaken(sequence: TrackedSequence) -> TrackedSequence:
+    """Every head turned and shifted a little, each in its own way."""
+    generator = torch.Generator().manual_seed(3)
+    joints = sequence.motion.joints.clone()
+    joints[:, 1] += 0.04 * torch.randn(N, 3, generator=generator)
+    translation = sequence.motion.translation + 0.003 * torch.randn(N, 3, generator=generator)
+    return replace(sequence, motion=replace(sequence.motion, joints=joints, translation=translation))
+
+
+def scatter(sequence: TrackedSequence, truth: TrackedSequence) -> Tensor:
+    """How far each head's turn is off, rad, what all have in common left out."""
+    ours, true = (_Poses(opaque_avatar(), s).rotation for s in (sequence, truth))
+    off = matrix_to_axis_angle(true.mT @ ours)
+    return (off - off.mean(0)).norm(dim=-1)
+
+
+def test_moved_motion_carries_the_posed_avatar() -> None:
+    avatar, sequence = opaque_avatar(), tiny_sequence()
+    twist = torch.tensor([0.1, -0.2, 0.05, 0.01, 0.02, -0.03])
+    poses = _Poses(avatar, sequence)
+    splats = avatar.pose(sequence.motion[4])
+    by_splats = carried(splats, twist, poses.pivot[4], torch.ones(len(splats.means), dtype=torch.bool))
+    by_motion = avatar.pose(poses.moved(twist.expand(sequence.n_frames, -1)).motion[4])
+    on_head = torch.ones(len(splats.means), dtype=torch.bool)
+    on_head[: avatar.neutral.n] = avatar.skin_weights[:, 0] == 0  # what hangs on the body stays with it
+    assert (by_splats.means - by_motion.means)[on_head].abs().max() < 1e-6
+    assert by_splats.sh_frames is not None
+    assert by_motion.sh_frames is not None
+    assert (by_splats.sh_frames - by_motion.sh_frames)[on_head].abs().max() < 1e-5
+    assert (by_splats.means - by_motion.means)[~on_head].norm(dim=-1).mean() > 1e-3
+
+
+def test_only_the_chosen_are_carried() -> None:
+    splats = opaque_avatar().pose(tiny_sequence().motion[0])
+    some = torch.arange(len(splats.means)) % 3 == 0
+    moved = carried(splats, torch.full((6,), 0.01), torch.zeros(3), some)
+    assert ((moved.means != splats.means).any(-1) == some).all()
+    assert torch.equal(moved.quats[~some], splats.quats[~some])
+
+
+def test_common_changes_are_left_to_the_avatar() -> None:
+    """A turn of all heads in their own axes does not move them; one that differs from frame to frame does."""
+    sequence = tiny_sequence()
+    poses, frames = _Poses(opaque_avatar(), sequence), torch.arange(2, 18)
+    common = torch.tensor([[0.02, -0.01, 0.03], [0.001, 0.002, -0.004]])
+    same = torch.einsum("tab,kb->tka", poses.rotation, common).flatten(1)
+    nothing = torch.zeros_like(same)
+    assert poses.without_common(same, nothing, frames)[frames].abs().max() < 1e-6
+    own = nothing.clone()
+    own[5, 0] = 0.1
+    assert poses.without_common(own, nothing, frames)[5, 0] > 0.09
+
+
+@pytest.mark.slow
+def test_poses_are_found_in_both_sets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(photometric, "STEPS", 300)
+    monkeypatch.setattr(photometric, "PASSES", tuple(range(60, 300, 30)))
+    truth, avatar = tiny_sequence(N, SIZE), opaque_avatar()
+    dataset = filmed(avatar, truth, tmp_path)
+    wrong = shaken(truth)
+    found = refine_track(dataset, wrong, tiny_head(), threads=1)
+    before, after = scatter(wrong, truth), scatter(found, truth)
+    for frames in (list(dataset.split.train), list(dataset.split.test)):
+        assert after[frames].mean() < 0.85 * before[frames].mean()
+    assert torch.equal(found.motion.expression, wrong.motion.expression)
+    assert torch.equal(found.motion.joints[:, 2:], wrong.motion.joints[:, 2:])
+    assert torch.equal(found.motion.joints[:, 0], wrong.motion.joints[:, 0])
+    again = refine_track(dataset, wrong, tiny_head(), threads=2)
+    assert torch.equal(again.motion.joints, found.motion.joints)
+
+
+def test_reduced_targets_are_means_of_pixels(tmp_path: Path) -> None:
+    dataset = filmed(opaque_avatar(), tiny_sequence(N, SIZE), tmp_path)
+    color, matte = dataset.target(5)
+    small = dataset.reduced(2)
+    less, less_matte = small.target(5)
+    assert small.size == less.shape[0] == SIZE // 2
+    assert (less - color.view(SIZE // 2, 2, SIZE // 2, 2, 3).mean((1, 3))).abs().max() < 1e-6
+    assert (less_matte - matte.view(SIZE // 2, 2, SIZE // 2, 2).mean((1, 3))).abs().max() < 1e-6
+    assert torch.allclose(small.camera(5).K[:2] * 2, dataset.camera(5).K[:2])
