@@ -11,7 +11,7 @@ from toonifygb.synthetic.light import FILL, GROUND, KEY, RIM, SKY
 from toonifygb.synthetic.refine import unit
 
 if TYPE_CHECKING:
-    from jaxtyping import Float32, Int64
+    from jaxtyping import Bool, Float32, Int64
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,11 @@ class Strands:
     def facing(self, least_cosine: float) -> Strands:
         """Those hairs with a point whose outward normal is turned to a camera at the origin by at least this."""
         cosine = -np.einsum("ski,ski->sk", self.outward, unit(self.points))
-        kept = (cosine > least_cosine).any(1)
-        return Strands(*(getattr(self, field.name)[kept] for field in fields(self)))
+        return self.chosen((cosine > least_cosine).any(1))
+
+    def chosen(self, which: Bool[np.ndarray, " s"] | Int64[np.ndarray, " c"]) -> Strands:
+        """Some of the hairs, by mask or by number."""
+        return Strands(*(getattr(self, field.name)[which] for field in fields(self)))
 
     def ribbons(self) -> tuple[Float32[np.ndarray, "n 3"], Int64[np.ndarray, "f 3"]]:
         """Mesh for a camera at the origin: two vertices for each point."""
