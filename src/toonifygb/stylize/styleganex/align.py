@@ -58,6 +58,11 @@ class FaceMarks:
         left, right = (points[list(eye)].mean(0) for eye in EYE_POINTS)
         return cls(left, right, points[MOUTH_CORNERS[0]], points[MOUTH_CORNERS[1]])
 
+    def scaled(self, scale: float, corner: tuple[int, int] = (0, 0)) -> FaceMarks:
+        """The same places in a picture that was scaled and of which the part from ``corner`` (x, y) on was cut out."""
+        places = (self.eye_left, self.eye_right, self.mouth_left, self.mouth_right)
+        return FaceMarks(*((place + 0.5) * scale - 0.5 - np.array(corner) for place in places))
+
     @property
     def eye_middle(self) -> Point:
         """Midway between the eyes."""
