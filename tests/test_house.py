@@ -43,6 +43,7 @@ ALLOWED_IN = {
     # Image maths only; files and cameras are opened in video/ alone, see BANNED_ATTRIBUTES.
     "cv2": ("video/", "face/", "stylize/", "track/overlay.py", "synthetic/", "pipeline/", "train/data.py"),
     "tyro": ("cli/",),
+    "onnxruntime": ("stylize/plugin.py",),
     "gsplat": ("render/cuda.py",),
     "ray": ("batch/",),
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from toonifygb.stylize.anchors import Faces, follow
-from toonifygb.stylize.base import Stylizer, available, get, register
+from toonifygb.stylize.base import Stylizer, WeightedStyle, available, files, get, register, register_weighted
 from toonifygb.stylize.ink import Ink
 from toonifygb.stylize.paint import Paint
 from toonifygb.stylize.plain import Plain
@@ -16,11 +16,14 @@ for _style in (Toon, Paint, Ink, Plain):
 __all__ = [
     "Faces",
     "Stylizer",
+    "WeightedStyle",
     "available",
+    "files",
     "follow",
     "get",
     "prepare",
     "register",
+    "register_weighted",
     "stylize_frames",
     "warp_frames",
     "warp_landmarks",

@@ -59,7 +59,7 @@ class FaceMarks:
         return cls(left, right, points[MOUTH_CORNERS[0]], points[MOUTH_CORNERS[1]])
 
     def scaled(self, scale: float, corner: tuple[int, int] = (0, 0)) -> FaceMarks:
-        """The same places in a picture that was scaled and of which the part from ``corner`` (x, y) on was cut out."""
+        """The same places in a picture that was scaled and then cut, with its corner (x, y) at ``corner``."""
         places = (self.eye_left, self.eye_right, self.mouth_left, self.mouth_right)
         return FaceMarks(*((place + 0.5) * scale - 0.5 - np.array(corner) for place in places))
 
@@ -191,7 +191,7 @@ def _cropped(image: Image, quad: Quad, border: int) -> tuple[Image, Quad]:
 
 
 def _padded(image: Image, quad: Quad, border: int, size: float) -> tuple[Image, Quad]:
-    """The picture continued where the quadrilateral leaves it: mirrored, increasingly blurred, fading to its median."""
+    """The picture continued where the quadrilateral leaves it: mirrored, blurred, and fading to its median."""
     height, width = image.shape[:2]
     left, top, right, bottom = _bounds(quad)
     missing = [max(side + border, 0) for side in (-left, -top, right - width, bottom - height)]
@@ -205,7 +205,7 @@ def _padded(image: Image, quad: Quad, border: int, size: float) -> tuple[Image, 
     outside = np.maximum(across[None, :], down[:, None])[..., None]
     wide += (_blurred(wide, size * 0.02) - wide) * np.clip(outside * 3.0 + 1.0, 0.0, 1.0)
     wide += (np.median(wide, axis=(0, 1)) - wide) * np.clip(outside, 0.0, 1.0)
-    return np.clip(np.rint(wide), 0, 255).astype(np.uint8), quad + [left, top]
+    return np.clip(np.rint(wide), 0, 255).astype(np.uint8), quad + np.array([left, top])
 
 
 def _blurred(image: Float[np.ndarray, "h w 3"], sigma_px: float) -> Float[np.ndarray, "h w 3"]:

@@ -75,7 +75,9 @@ class AlignedStylizer:
             ]
         )
 
-    def _draw(self, frame: Frame, points: Float[np.ndarray, "478 2"], presence: float, state: dict[str, Any]) -> Frame:
+    def _draw(
+        self, frame: Frame, points: Float[np.ndarray, "478 2"], presence: float, state: dict[str, Any]
+    ) -> Frame:
         marks = FaceMarks.from_mediapipe(points)
         aligned = align_face(frame, marks)
         codes = state["w_plus"] if "w_plus" in state else self._engine.codes(aligned.image)

@@ -102,10 +102,12 @@ class Engine:
         return "cuda" if torch.cuda.is_available() else "cpu"
 
     def _loaded(self) -> Network:
-        if self._network is None:
-            log.info("StyleGANEX runs on %s in %s", self._device, self.config.precision)
-            self._network = self._load().to(self._device)
-        return self._network
+        if self._network is not None:
+            return self._network
+        log.info("StyleGANEX runs on %s in %s", self._device, self.config.precision)
+        network: Network = self._load().to(self._device)
+        self._network = network
+        return network
 
     def _specialised(self, codes: Codes) -> Callable:
         """The network of these codes; the latest is kept."""

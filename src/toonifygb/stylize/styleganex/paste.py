@@ -1,9 +1,9 @@
 """The network's output put back to where it came from, at the size of the source.
 
 Where the output does not reach, the source shows, with its colours made to follow: first through the affine map
-that explains the output's colours by the source's best, then by what that map leaves unexplained at the nearest part
-of the seam, carried outwards as a smooth field. Over a feathered strip the output fades into it; so neither colour
-nor brightness steps at the seam. Everything depends on the one frame alone.
+that explains the output's colours by the source's best, then by what that map leaves unexplained at the nearest
+part of the seam, carried outwards as a smooth field. Over a feathered strip the output fades into it; so neither
+colour nor brightness steps at the seam. Everything depends on the one frame alone.
 """
 
 from __future__ import annotations
