@@ -245,5 +245,5 @@ def test_layers(golden: Golden, record_property: pytest.RecordProperty) -> None:
             assert error <= EXACT, (stem, name)
         for name, (mean, deviation, peak) in meta["layers"].items():
             value = seen[name].double()
-            statistics = [value.mean().item(), value.std(correction=0).item(), value.abs().max().item()]
+            statistics = [value.mean().item(), value.std().item(), value.abs().max().item()]
             assert statistics == pytest.approx([mean, deviation, peak], abs=2 * EXACT), name
