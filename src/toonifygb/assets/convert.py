@@ -203,21 +203,16 @@ def _inspect(program: memoryview, path: Path) -> int:
     known = set(_names())
     if len(program) > _MOST_PICKLE_BYTES:
         raise AssetError(f"{path} describes its tensors in {len(program)} bytes; more than any network needs")
-    strings: list[str] = []
     for count, (instruction, argument, position) in enumerate(pickletools.genops(program.tobytes())):
         name = instruction.name
-        if name == "GLOBAL":
+        if name == "GLOBAL":  # its successor takes the name off the stack; then the unpickler looks at it
             _check_name(tuple(str(argument).split(" ", 1)), known, path)
-        elif name == "STACK_GLOBAL":
-            _check_name(tuple(strings[-2:]), known, path)
         elif name in ("INST", "OBJ", "EXT1", "EXT2", "EXT4"):
             raise AssetError(f"{path} holds the instruction {name}, which can run code; nothing was run", _KEEP_OUT)
         elif name.endswith("PUT") and int(argument) > count:  # type: ignore[arg-type]
             raise AssetError(f"{path} is damaged: it numbers its objects beyond their count")
         elif name == "STOP":
             return (position or 0) + 1
-        if isinstance(argument, str):
-            strings.append(argument)
     raise AssetError(f"{path} is damaged or cut short", "download it again")
 
 
