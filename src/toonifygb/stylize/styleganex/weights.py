@@ -10,6 +10,7 @@ import json
 import os
 import re
 from dataclasses import asdict, fields, replace
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -149,8 +150,7 @@ def _used(state: Mapping[str, StoredTensor], options: Mapping[str, Any]) -> dict
 
 def check_shapes(shapes: Mapping[str, tuple[int, ...]], variant: Variant, path: Path) -> None:
     """Raises AssetError, naming the keys, unless the shapes are those of the variant (``OPTIONAL`` may lack)."""
-    with torch.device("meta"):
-        expected = {key: tuple(value.shape) for key, value in StyleGANEX(variant).state_dict().items()}
+    expected = _shapes(variant)
     missing = [key for key in expected if key not in shapes and not _OPTIONAL.fullmatch(key)]
     extra = [key for key in shapes if key not in expected]
     wrong = [
@@ -164,6 +164,13 @@ def check_shapes(shapes: Mapping[str, tuple[int, ...]], variant: Variant, path: 
         raise AssetError(
             f"{path} is not the StyleGANEX network '{variant.name}': it {'; it '.join(faults)}", _NEWER
         )
+
+
+@cache
+def _shapes(variant: Variant) -> dict[str, tuple[int, ...]]:
+    """Shape of every tensor of a variant."""
+    with torch.device("meta"):
+        return {key: tuple(value.shape) for key, value in StyleGANEX(variant).state_dict().items()}
 
 
 def assembled(
