@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from toonifygb.cli.assets import assets
 from toonifygb.cli.progress import Terminal
 from toonifygb.config import PRESETS, FaceConfig, Quality, RunConfig, StylizeConfig, TrackConfig, TrackOn, override
 
@@ -233,6 +234,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "track": track,
     "train": train,
     "render": render,
+    "assets": assets,
     "doctor": doctor,
 }
 

@@ -1,7 +1,7 @@
 """The encoder: an IR-SE50 trunk with heads for style codes (pSp), a first-layer feature and skip features.
 
-Sizes for an input of H x W, both multiples of 8. The trunk is an input layer and 24 residual units, and is tapped at
-seven places (``Taps``).
+The input is H x W, both multiples of 8. The trunk is an input layer and 24 residual units, tapped at seven places
+(``Taps``).
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 
 STAGES = ((64, 3), (128, 4), (256, 14), (512, 3))
 """Channels and number of units; the first unit of each halves the size."""
-SKIP_UNIT, FEATURE_UNITS, LAST_FEATURE_UNIT = 2, (10, 15, 20), 20
+TAPPED_UNITS = (2, 6, 10, 15, 20)
+LAST_FEATURE_UNIT = TAPPED_UNITS[-1]
+"""Units beyond it serve the style codes alone."""
 SE_REDUCTION = 16
 COARSE, MIDDLE = 3, 7
 """Codes below 3 are read at 1/16 of the input's size, below 7 at 1/8, the others at 1/4."""
@@ -41,6 +43,12 @@ class Taps(NamedTuple):
     c2: Float[Tensor, "n 256 h8 w8"]
     c3: Float[Tensor, "n 512 h16 w16"] | None
     """Absent where only features were asked for."""
+
+    @classmethod
+    def of(cls, maps: list[Tensor]) -> Taps:
+        """The taps among the maps after the input layer and after each unit."""
+        c128, c1, c21, c22, c2 = (maps[1 + unit] for unit in TAPPED_UNITS)
+        return cls(maps[0], c128, c1, c21, c22, c2, maps[-1] if len(maps) > 2 + LAST_FEATURE_UNIT else None)
 
     def skips(self) -> tuple[Tensor, ...]:
         """Skip feature of each fusion layer."""
@@ -181,14 +189,10 @@ class Encoder(nn.Module):
 
     def trunk(self, x: Float[Tensor, "n c h w"], *, whole: bool) -> Taps:
         """Features of the trunk; its last three units only where the ``whole`` is asked for."""
-        y = self.input_label_layer(x) if self.reads_labels else self.input_layer(x)
-        seen = [y]
+        maps = [self.input_label_layer(x) if self.reads_labels else self.input_layer(x)]
         for unit in self.body if whole else self.body[: LAST_FEATURE_UNIT + 1]:
-            y = unit(y)
-            seen.append(y)
-        c128, c1 = seen[1 + SKIP_UNIT], seen[1 + 6]
-        c21, c22, c2 = (seen[1 + unit] for unit in FEATURE_UNITS)
-        return Taps(seen[0], c128, c1, c21, c22, c2, y if whole else None)
+            maps.append(unit(maps[-1]))
+        return Taps.of(maps)
 
     def codes(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n 18 512"]:
         """Style codes of an image, without the average latent."""

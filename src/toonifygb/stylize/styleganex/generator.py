@@ -124,7 +124,7 @@ class Generator(nn.Module):
     ) -> Float[Tensor, "n 3 h w"]:
         """The image, from about -1 to 1 and not clamped.
 
-        Code 0 goes to the stem; codes 1+2j, 2+2j to the convolutions of level j; 3+2j to its ``ToRGB``, and so again
+        Code 0 goes to the stem; codes 1+2j and 2+2j to the convolutions of level j; 3+2j to its ``ToRGB`` and again
         to the first convolution of the next level.
 
         Args:

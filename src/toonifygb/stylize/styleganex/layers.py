@@ -191,7 +191,7 @@ class NoiseStrength(nn.Module):
         if mode == "zero":
             return x
         if mode == "fixed":
-            return x + self.weight * F.adaptive_avg_pool2d(stored, x.shape[2:])
+            return x + self.weight * F.adaptive_avg_pool2d(stored, (x.shape[2], x.shape[3]))
         return x + self.weight * torch.randn(len(x), 1, *x.shape[2:], dtype=x.dtype, device=x.device)
 
 

@@ -52,12 +52,12 @@ class StyleGANEX(nn.Module):
 
     def codes(self, x2: Float[Tensor, "n c h w"]) -> Float[Tensor, "n 18 512"]:
         """w+ of an aligned face (256 px as published): E(x2) + average latent."""
-        self.check(x2)
+        check_image(x2, self.variant.input_channels)
         return self.encoder.codes(x2) + self.latent_avg
 
     def features(self, x1: Float[Tensor, "n c h w"]) -> tuple[Float[Tensor, "n 512 h8 w8"], tuple[Tensor, ...]]:
         """First-layer feature and skip features of a frame."""
-        self.check(x1)
+        check_image(x1, self.variant.input_channels)
         return self.encoder.features(x1)
 
     def synthesize(
@@ -108,7 +108,7 @@ class StyleGANEX(nn.Module):
 
         Args:
             x1: frame.
-            x2: aligned face ``m c h w`` whose style is taken, or its codes ``m 18 512``; None takes the frame's own.
+            x2: aligned face ``m c h w`` whose style is taken, or its codes ``m 18 512``; None for the frame's own.
             edit: see ``synthesize``.
             noise: see ``synthesize``.
             levels: see ``synthesize``.
@@ -116,11 +116,11 @@ class StyleGANEX(nn.Module):
         w_plus = x2 if x2 is not None and x2.ndim == 3 else self.codes(x1 if x2 is None else x2)
         return self.synthesize(*self.features(x1), w_plus, edit=edit, noise=noise, levels=levels)
 
-    def check(self, image: Tensor) -> None:
-        """Raises InputError where ``image`` is not ``n c h w`` with this network's channels and multiples of 8."""
-        channels = self.variant.input_channels
-        if image.ndim != 4 or image.shape[1] != channels or image.shape[2] % MULTIPLE or image.shape[3] % MULTIPLE:
-            raise InputError(
-                f"the network was given an image of shape {list(image.shape)}; "
-                f"expected [n, {channels}, h, w] with h and w multiples of {MULTIPLE}"
-            )
+
+def check_image(image: Tensor, channels: int) -> None:
+    """Raises InputError where ``image`` is not ``n c h w`` of so many channels and with sides of multiples of 8."""
+    if image.ndim != 4 or image.shape[1] != channels or image.shape[2] % MULTIPLE or image.shape[3] % MULTIPLE:
+        raise InputError(
+            f"the network was given an image of shape {list(image.shape)}; "
+            f"expected [n, {channels}, h, w] with h and w multiples of {MULTIPLE}"
+        )

@@ -1,0 +1,158 @@
+"""StyleGANEX at full width: cost of a frame, plain and specialised to a clip, and what the shortcuts cost in quality.
+
+Weights come from a seeded generator (``tests/stylize/styleganex_weights.py``), so no file is needed; the arithmetic
+does not depend on what they are. Decibels are those of clamped images in -1..1 against the plain network.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import runpy
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from benchmarks.harness import ROOT, Figure, cpu_seconds
+from toonifygb.stylize.styleganex import PUBLISHED
+from toonifygb.stylize.styleganex.fast import compile_clip
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from torch import Tensor
+
+    from toonifygb.stylize.styleganex import StyleGANEX
+
+SIZES = (352, 512)
+"""Sides of square network inputs: a face of a typical 512 px clip, and the largest that the procedure makes."""
+NAMES = {torch.float32: "float32", torch.bfloat16: "bfloat16"}
+MATRIX = 2048
+COMPILE_VARIABLE = "TOONIFYGB_BENCH_COMPILE"
+"""Compilation takes minutes where the C++ compiler is slow, so it is measured on request."""
+
+
+def run() -> list[Figure]:
+    """Seconds of one core per frame, dB, GB, and multiply-adds per second beside a large matrix product's."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return measured()
+    finally:
+        torch.set_num_threads(threads)
+
+
+def measured() -> list[Figure]:
+    """All figures."""
+    make = runpy.run_path(str(ROOT / "tests" / "stylize" / "styleganex_weights.py"))["make_network"]
+    network: StyleGANEX = make(PUBLISHED["toonify"]).requires_grad_(False)
+    peaks = {dtype: matmul_rate(dtype) for dtype in NAMES}
+    rng = torch.Generator().manual_seed(1)
+    face = smooth_image(256, rng)
+    with torch.inference_mode():
+        w_plus = network.codes(face)
+        figures = [Figure(f"matrix product, {name}", peaks[dtype] / 1e9, "GMAC/s") for dtype, name in NAMES.items()]
+        figures.append(Figure("style codes, once per clip", cpu_seconds(lambda: network.codes(face)), "s"))
+        figures.append(Figure("modulating and folding, once per clip", folding(network, w_plus), "s"))
+        for side in SIZES:
+            figures += frame_figures(network, w_plus, smooth_image(side, rng), peaks)
+        if os.environ.get(COMPILE_VARIABLE):
+            figures += compiled_figures(network, w_plus, smooth_image(SIZES[0], rng))
+    return figures
+
+
+def frame_figures(
+    network: StyleGANEX, w_plus: Tensor, frame: Tensor, peaks: dict[torch.dtype, float]
+) -> list[Figure]:
+    """One size of frame."""
+    side = frame.shape[-1]
+    start = time.process_time()
+    plain, plain_peak = with_peak(lambda: network(frame, w_plus))
+    plain_seconds = time.process_time() - start
+    figures = [
+        Figure(f"plain, {side} px", plain_seconds, "s"),
+        Figure(f"plain, {side} px, memory of a frame", plain_peak, "GB"),
+    ]
+    for dtype, name in NAMES.items():
+        for levels in (8, 7, 6):
+            clip = compile_clip(network, w_plus, dtype=dtype, levels=levels)
+            found, peak = with_peak(lambda clip=clip: clip(frame))
+            macs = multiply_adds(lambda clip=clip: clip(frame))
+            seconds = cpu_seconds(lambda clip=clip: clip(frame), budget=6.0)
+            claim = f"{name}, {side} px to {found.shape[-1]} px"
+            figures.append(Figure(claim, seconds, "s", baseline=plain_seconds, floor=macs / peaks[dtype]))
+            if levels == 8:
+                rate = macs / seconds
+                figures += [
+                    Figure(f"{claim}, against plain", decibels(found, plain), "dB"),
+                    Figure(f"{claim}, memory of a frame", peak, "GB", baseline=plain_peak),
+                    Figure(f"{claim}, rate", rate / 1e9, "GMAC/s", floor=peaks[dtype] / 1e9),
+                    Figure(f"{claim}, multiply-adds", macs / 1e9, "G"),
+                ]
+    return figures
+
+
+def compiled_figures(network: StyleGANEX, w_plus: Tensor, frame: Tensor) -> list[Figure]:
+    """The clip network compiled by torch, and what compiling costs in wall time."""
+    figures = []
+    for dtype, name in NAMES.items():
+        eager = cpu_seconds(lambda dtype=dtype: compile_clip(network, w_plus, dtype=dtype)(frame), budget=6.0)
+        clip = compile_clip(network, w_plus, dtype=dtype, compiled=True)
+        start = time.perf_counter()
+        clip(frame)
+        once = time.perf_counter() - start
+        seconds = cpu_seconds(lambda clip=clip: clip(frame), budget=6.0)
+        figures += [
+            Figure(f"{name} compiled, {frame.shape[-1]} px", seconds, "s", baseline=eager),
+            Figure(f"{name}, compiling once, wall time", once, "s"),
+        ]
+    return figures
+
+
+def folding(network: StyleGANEX, w_plus: Tensor) -> float:
+    """Seconds of one core to make a clip network."""
+    return cpu_seconds(lambda: compile_clip(network, w_plus))
+
+
+def matmul_rate(dtype: torch.dtype) -> float:
+    """Multiply-adds per second of a large matrix product on one core."""
+    a, b = (torch.randn(MATRIX, MATRIX).to(dtype) for _ in range(2))
+    return MATRIX**3 / cpu_seconds(lambda: a @ b)
+
+
+def multiply_adds(job: Callable[[], Any]) -> float:
+    """Multiply-adds of convolutions and matrix products in ``job``."""
+    with FlopCounterMode(display=False) as counter:
+        job()
+    return counter.get_total_flops() / 2
+
+
+def smooth_image(side: int, rng: torch.Generator) -> Tensor:
+    """A picture of soft shapes, -1..1."""
+    coarse = torch.rand(1, 3, 12, 12, generator=rng) * 2 - 1
+    return torch.nn.functional.interpolate(coarse, size=(side, side), mode="bicubic").clamp(-1, 1)
+
+
+def decibels(found: Tensor, expected: Tensor) -> float:
+    """Peak signal-to-noise ratio of images in -1..1."""
+    error = (found.clamp(-1, 1) - expected.clamp(-1, 1)).double().square().mean().item()
+    return 10 * math.log10(4 / max(error, 1e-20))
+
+
+def with_peak(job: Callable[[], Tensor]) -> tuple[Tensor, float]:
+    """The result, and the most memory that was in use above what was before, GB; 0 where nobody counts it."""
+    status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+    if not (status.is_file() and reset.is_file()):
+        return job(), 0.0
+    reset.write_text("5")  # the high-water mark begins at what is in use now
+    before = _memory(status, "VmRSS")
+    result = job()
+    return result, (_memory(status, "VmHWM") - before) / 1e9
+
+
+def _memory(status: Path, field: str) -> int:
+    line = next(line for line in status.read_text().splitlines() if line.startswith(f"{field}:"))
+    return int(line.split()[1]) * 1024
