@@ -15,7 +15,7 @@ import pytest
 
 from toonifygb import stylize, video
 from toonifygb.config import RunConfig, StylizeConfig
-from toonifygb.errors import InputError
+from toonifygb.errors import FaceError, InputError
 from toonifygb.pipeline import segments as pieces
 from toonifygb.pipeline.files import load_state, save_state
 from toonifygb.pipeline.segments import Segments
@@ -23,21 +23,26 @@ from toonifygb.pipeline.single import stylize_file
 from toonifygb.pipeline.source import Source, open_source
 from toonifygb.progress import SILENT, Stopped
 
-N_FRAMES, WIDTH, HEIGHT = 30, 64, 48
+N_FRAMES, WIDTH, HEIGHT = 28, 160, 128
 SEGMENT = 8
 
 
 @pytest.fixture(autouse=True)
-def _short_segments(monkeypatch: pytest.MonkeyPatch) -> None:
+def _short_segments_without_a_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none_found(*_: object, **__: object) -> None:
+        raise FaceError("no face")
+
+    monkeypatch.setattr("toonifygb.pipeline.single.face.find_landmarks", none_found)
     monkeypatch.setattr(pieces, "SEGMENT", SEGMENT)
     monkeypatch.setattr("toonifygb.pipeline.create.SEGMENT", SEGMENT)
 
 
 def pictures() -> Iterator[np.ndarray]:
-    """Noise that drifts: no two frames alike, and each worth coding."""
-    noise = np.random.default_rng(5).integers(60, 200, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    """Soft waves that drift: no two frames alike. (Of noise, x264 does not always make the same bytes.)"""
+    x = np.arange(WIDTH)[None, :, None] + 5.0 * np.arange(3)
+    y = np.arange(HEIGHT)[:, None, None]
     for index in range(N_FRAMES):
-        yield np.roll(noise, 2 * index, axis=1)
+        yield (128 + 80 * np.sin(0.2 * x + 0.1 * y + 0.3 * index)).astype(np.uint8)
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +164,11 @@ def test_killed_without_warning(clip: Path, tmp_path: Path) -> None:
         "import sys, time, torch\n"
         "torch.set_num_threads(1)\n"
         "from toonifygb.cli.main import main\n"
-        "from toonifygb.pipeline import create, segments\n"
+        "from toonifygb.errors import FaceError\n"
+        "from toonifygb.pipeline import create, segments, single\n"
+        "def none_found(*_, **__):\n"
+        "    raise FaceError('no face')\n"
+        "single.face.find_landmarks = none_found\n"
         f"create.SEGMENT = segments.SEGMENT = {SEGMENT}\n"
         "write = segments.video.Writer.write\n"
         "def slowly(self, frame):\n"
