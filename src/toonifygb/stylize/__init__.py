@@ -10,6 +10,7 @@ from toonifygb.stylize.ink import Ink
 from toonifygb.stylize.paint import Paint
 from toonifygb.stylize.plain import Plain
 from toonifygb.stylize.run import prepare, stylize_frames, warp_frames, warp_landmarks
+from toonifygb.stylize.steadiness import warping_error
 from toonifygb.stylize.styleganex import styles as _styleganex
 from toonifygb.stylize.toon import Toon
 
@@ -34,4 +35,5 @@ __all__ = [
     "stylize_frames",
     "warp_frames",
     "warp_landmarks",
+    "warping_error",
 ]
