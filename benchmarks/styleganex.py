@@ -1,4 +1,4 @@
-"""StyleGANEX at full width: cost of a frame, plain and specialised to a clip, and what the shortcuts cost in quality.
+"""StyleGANEX at full width: cost of a frame, plain and specialised to a clip, and what shortcuts cost in quality.
 
 Weights come from a seeded generator (``tests/stylize/styleganex_weights.py``), so no file is needed; the arithmetic
 does not depend on what they are. Decibels are those of clamped images in -1..1 against the plain network.
@@ -99,7 +99,8 @@ def compiled_figures(network: StyleGANEX, w_plus: Tensor, frame: Tensor) -> list
     """The clip network compiled by torch, and what compiling costs in wall time."""
     figures = []
     for dtype, name in NAMES.items():
-        eager = cpu_seconds(lambda dtype=dtype: compile_clip(network, w_plus, dtype=dtype)(frame), budget=6.0)
+        eager_clip = compile_clip(network, w_plus, dtype=dtype)
+        eager = cpu_seconds(lambda clip=eager_clip: clip(frame), budget=6.0)
         clip = compile_clip(network, w_plus, dtype=dtype, compiled=True)
         start = time.perf_counter()
         clip(frame)
