@@ -11,7 +11,7 @@ import os
 import runpy
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch.utils.flop_counter import FlopCounterMode
@@ -69,9 +69,8 @@ def frame_figures(
 ) -> list[Figure]:
     """One size of frame."""
     side = frame.shape[-1]
-    start = time.process_time()
-    plain, plain_peak = with_peak(lambda: network(frame, w_plus))
-    plain_seconds = time.process_time() - start
+    plain, plain_peak, _ = observed(lambda: network(frame, w_plus))
+    plain_seconds = once(lambda: network(frame, w_plus))
     figures = [
         Figure(f"plain, {side} px", plain_seconds, "s"),
         Figure(f"plain, {side} px, memory of a frame", plain_peak, "GB"),
@@ -79,9 +78,8 @@ def frame_figures(
     for dtype, name in NAMES.items():
         for levels in (8, 7, 6):
             clip = compile_clip(network, w_plus, dtype=dtype, levels=levels)
-            found, peak = with_peak(lambda clip=clip: clip(frame))
-            macs = multiply_adds(lambda clip=clip: clip(frame))
-            seconds = cpu_seconds(lambda clip=clip: clip(frame), budget=6.0)
+            found, peak, macs = observed(lambda clip=clip: clip(frame))
+            seconds = once(lambda clip=clip: clip(frame))
             claim = f"{name}, {side} px to {found.shape[-1]} px"
             figures.append(Figure(claim, seconds, "s", baseline=plain_seconds, floor=macs / peaks[dtype]))
             if levels == 8:
@@ -104,11 +102,11 @@ def compiled_figures(network: StyleGANEX, w_plus: Tensor, frame: Tensor) -> list
         clip = compile_clip(network, w_plus, dtype=dtype, compiled=True)
         start = time.perf_counter()
         clip(frame)
-        once = time.perf_counter() - start
+        compiling = time.perf_counter() - start
         seconds = cpu_seconds(lambda clip=clip: clip(frame), budget=6.0)
         figures += [
             Figure(f"{name} compiled, {frame.shape[-1]} px", seconds, "s", baseline=eager),
-            Figure(f"{name}, compiling once, wall time", once, "s"),
+            Figure(f"{name}, compiling once, wall time", compiling, "s"),
         ]
     return figures
 
@@ -124,11 +122,11 @@ def matmul_rate(dtype: torch.dtype) -> float:
     return MATRIX**3 / cpu_seconds(lambda: a @ b)
 
 
-def multiply_adds(job: Callable[[], Any]) -> float:
-    """Multiply-adds of convolutions and matrix products in ``job``."""
-    with FlopCounterMode(display=False) as counter:
-        job()
-    return counter.get_total_flops() / 2
+def once(job: Callable[[], object]) -> float:
+    """Processor time of a job that has run before, s; it takes seconds, so one run is a fair sample."""
+    start = time.process_time()
+    job()
+    return time.process_time() - start
 
 
 def smooth_image(side: int, rng: torch.Generator) -> Tensor:
@@ -143,15 +141,17 @@ def decibels(found: Tensor, expected: Tensor) -> float:
     return 10 * math.log10(4 / max(error, 1e-20))
 
 
-def with_peak(job: Callable[[], Tensor]) -> tuple[Tensor, float]:
-    """The result, and the most memory that was in use above what was before, GB; 0 where nobody counts it."""
+def observed(job: Callable[[], Tensor]) -> tuple[Tensor, float, float]:
+    """The result; the most memory in use above what was before, GB, NaN where nobody counts it; multiply-adds."""
     status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-    if not (status.is_file() and reset.is_file()):
-        return job(), 0.0
-    reset.write_text("5")  # the high-water mark begins at what is in use now
-    before = _memory(status, "VmRSS")
-    result = job()
-    return result, (_memory(status, "VmHWM") - before) / 1e9
+    counts = status.is_file() and reset.is_file()
+    before = _memory(status, "VmRSS") if counts else 0
+    if counts:
+        reset.write_text("5")  # the high-water mark begins at what is in use now
+    with FlopCounterMode(display=False) as counter:
+        result = job()
+    peak = (_memory(status, "VmHWM") - before) / 1e9 if counts else math.nan
+    return result, peak, counter.get_total_flops() / 2
 
 
 def _memory(status: Path, field: str) -> int:
