@@ -10,6 +10,7 @@ import math
 import os
 import runpy
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -69,26 +70,25 @@ def frame_figures(
 ) -> list[Figure]:
     """One size of frame."""
     side = frame.shape[-1]
-    plain, plain_peak, _ = observed(lambda: network(frame, w_plus))
-    plain_seconds = once(lambda: network(frame, w_plus))
+    plain = observed(lambda: network(frame, w_plus))
     figures = [
-        Figure(f"plain, {side} px", plain_seconds, "s"),
-        Figure(f"plain, {side} px, memory of a frame", plain_peak, "GB"),
+        Figure(f"plain, {side} px", plain.seconds, "s"),
+        Figure(f"plain, {side} px, memory of a frame", plain.peak_gb, "GB"),
     ]
     for dtype, name in NAMES.items():
         for levels in (8, 7, 6):
             clip = compile_clip(network, w_plus, dtype=dtype, levels=levels)
-            found, peak, macs = observed(lambda clip=clip: clip(frame))
-            seconds = once(lambda clip=clip: clip(frame))
-            claim = f"{name}, {side} px to {found.shape[-1]} px"
-            figures.append(Figure(claim, seconds, "s", baseline=plain_seconds, floor=macs / peaks[dtype]))
+            found = observed(lambda clip=clip: clip(frame))
+            claim = f"{name}, {side} px to {found.image.shape[-1]} px"
+            floor = found.macs / peaks[dtype]
+            figures.append(Figure(claim, found.seconds, "s", baseline=plain.seconds, floor=floor))
             if levels == 8:
-                rate = macs / seconds
+                rate = found.macs / found.seconds / 1e9
                 figures += [
-                    Figure(f"{claim}, against plain", decibels(found, plain), "dB"),
-                    Figure(f"{claim}, memory of a frame", peak, "GB", baseline=plain_peak),
-                    Figure(f"{claim}, rate", rate / 1e9, "GMAC/s", floor=peaks[dtype] / 1e9),
-                    Figure(f"{claim}, multiply-adds", macs / 1e9, "G"),
+                    Figure(f"{claim}, against plain", decibels(found.image, plain.image), "dB"),
+                    Figure(f"{claim}, memory of a frame", found.peak_gb, "GB", baseline=plain.peak_gb),
+                    Figure(f"{claim}, multiply-adds", found.macs / 1e9, "G", baseline=plain.macs / 1e9),
+                    Figure(f"{claim}, rate", rate, "GMAC/s", floor=peaks[dtype] / 1e9),
                 ]
     return figures
 
@@ -122,13 +122,6 @@ def matmul_rate(dtype: torch.dtype) -> float:
     return MATRIX**3 / cpu_seconds(lambda: a @ b)
 
 
-def once(job: Callable[[], object]) -> float:
-    """Processor time of a job that has run before, s; it takes seconds, so one run is a fair sample."""
-    start = time.process_time()
-    job()
-    return time.process_time() - start
-
-
 def smooth_image(side: int, rng: torch.Generator) -> Tensor:
     """A picture of soft shapes, -1..1."""
     coarse = torch.rand(1, 3, 12, 12, generator=rng) * 2 - 1
@@ -141,17 +134,32 @@ def decibels(found: Tensor, expected: Tensor) -> float:
     return 10 * math.log10(4 / max(error, 1e-20))
 
 
-def observed(job: Callable[[], Tensor]) -> tuple[Tensor, float, float]:
-    """The result; the most memory in use above what was before, GB, NaN where nobody counts it; multiply-adds."""
+@dataclass(frozen=True)
+class Observed:
+    """One run of a job that takes seconds, which is a fair sample of its time."""
+
+    image: Tensor
+    seconds: float
+    """Processor time."""
+    peak_gb: float
+    """Most memory in use above what was before; 0 where nobody counts it (Linux does)."""
+    macs: float
+    """Multiply-adds of convolutions and matrix products."""
+
+
+def observed(job: Callable[[], Tensor]) -> Observed:
+    """Runs ``job`` once under all instruments."""
     status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
     counts = status.is_file() and reset.is_file()
     before = _memory(status, "VmRSS") if counts else 0
     if counts:
         reset.write_text("5")  # the high-water mark begins at what is in use now
     with FlopCounterMode(display=False) as counter:
-        result = job()
-    peak = (_memory(status, "VmHWM") - before) / 1e9 if counts else math.nan
-    return result, peak, counter.get_total_flops() / 2
+        start = time.process_time()
+        image = job()
+        seconds = time.process_time() - start
+    peak = _memory(status, "VmHWM") - before if counts else 0
+    return Observed(image, seconds, peak / 1e9, counter.get_total_flops() / 2)
 
 
 def _memory(status: Path, field: str) -> int:
