@@ -1,4 +1,4 @@
-"""StyleGANEX at full width: cost of a frame, plain and specialised to a clip, and what the shortcuts cost in quality.
+"""StyleGANEX at full width: cost of a frame, plain and specialised to a clip, and what shortcuts cost in quality.
 
 Weights come from a seeded generator (``tests/stylize/styleganex_weights.py``), so no file is needed; the arithmetic
 does not depend on what they are. Decibels are those of clamped images in -1..1 against the plain network.
@@ -10,8 +10,9 @@ import math
 import os
 import runpy
 import time
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch.utils.flop_counter import FlopCounterMode
@@ -69,28 +70,25 @@ def frame_figures(
 ) -> list[Figure]:
     """One size of frame."""
     side = frame.shape[-1]
-    start = time.process_time()
-    plain, plain_peak = with_peak(lambda: network(frame, w_plus))
-    plain_seconds = time.process_time() - start
+    plain = observed(lambda: network(frame, w_plus))
     figures = [
-        Figure(f"plain, {side} px", plain_seconds, "s"),
-        Figure(f"plain, {side} px, memory of a frame", plain_peak, "GB"),
+        Figure(f"plain, {side} px", plain.seconds, "s"),
+        Figure(f"plain, {side} px, memory of a frame", plain.peak_gb, "GB"),
     ]
     for dtype, name in NAMES.items():
         for levels in (8, 7, 6):
             clip = compile_clip(network, w_plus, dtype=dtype, levels=levels)
-            found, peak = with_peak(lambda clip=clip: clip(frame))
-            macs = multiply_adds(lambda clip=clip: clip(frame))
-            seconds = cpu_seconds(lambda clip=clip: clip(frame), budget=6.0)
-            claim = f"{name}, {side} px to {found.shape[-1]} px"
-            figures.append(Figure(claim, seconds, "s", baseline=plain_seconds, floor=macs / peaks[dtype]))
+            found = observed(lambda clip=clip: clip(frame))
+            claim = f"{name}, {side} px to {found.image.shape[-1]} px"
+            floor = found.macs / peaks[dtype]
+            figures.append(Figure(claim, found.seconds, "s", baseline=plain.seconds, floor=floor))
             if levels == 8:
-                rate = macs / seconds
+                rate = found.macs / found.seconds / 1e9
                 figures += [
-                    Figure(f"{claim}, against plain", decibels(found, plain), "dB"),
-                    Figure(f"{claim}, memory of a frame", peak, "GB", baseline=plain_peak),
-                    Figure(f"{claim}, rate", rate / 1e9, "GMAC/s", floor=peaks[dtype] / 1e9),
-                    Figure(f"{claim}, multiply-adds", macs / 1e9, "G"),
+                    Figure(f"{claim}, against plain", decibels(found.image, plain.image), "dB"),
+                    Figure(f"{claim}, memory of a frame", found.peak_gb, "GB", baseline=plain.peak_gb),
+                    Figure(f"{claim}, multiply-adds", found.macs / 1e9, "G", baseline=plain.macs / 1e9),
+                    Figure(f"{claim}, rate", rate, "GMAC/s", floor=peaks[dtype] / 1e9),
                 ]
     return figures
 
@@ -99,15 +97,18 @@ def compiled_figures(network: StyleGANEX, w_plus: Tensor, frame: Tensor) -> list
     """The clip network compiled by torch, and what compiling costs in wall time."""
     figures = []
     for dtype, name in NAMES.items():
-        eager = cpu_seconds(lambda dtype=dtype: compile_clip(network, w_plus, dtype=dtype)(frame), budget=6.0)
+        eager_clip = compile_clip(network, w_plus, dtype=dtype)
+        eager = observed(lambda clip=eager_clip: clip(frame)).seconds
         clip = compile_clip(network, w_plus, dtype=dtype, compiled=True)
         start = time.perf_counter()
         clip(frame)
-        once = time.perf_counter() - start
-        seconds = cpu_seconds(lambda clip=clip: clip(frame), budget=6.0)
+        compiling = time.perf_counter() - start
+        start = time.process_time()
+        clip(frame)
+        seconds = time.process_time() - start
         figures += [
             Figure(f"{name} compiled, {frame.shape[-1]} px", seconds, "s", baseline=eager),
-            Figure(f"{name}, compiling once, wall time", once, "s"),
+            Figure(f"{name}, compiling once, wall time", compiling, "s"),
         ]
     return figures
 
@@ -123,13 +124,6 @@ def matmul_rate(dtype: torch.dtype) -> float:
     return MATRIX**3 / cpu_seconds(lambda: a @ b)
 
 
-def multiply_adds(job: Callable[[], Any]) -> float:
-    """Multiply-adds of convolutions and matrix products in ``job``."""
-    with FlopCounterMode(display=False) as counter:
-        job()
-    return counter.get_total_flops() / 2
-
-
 def smooth_image(side: int, rng: torch.Generator) -> Tensor:
     """A picture of soft shapes, -1..1."""
     coarse = torch.rand(1, 3, 12, 12, generator=rng) * 2 - 1
@@ -142,15 +136,32 @@ def decibels(found: Tensor, expected: Tensor) -> float:
     return 10 * math.log10(4 / max(error, 1e-20))
 
 
-def with_peak(job: Callable[[], Tensor]) -> tuple[Tensor, float]:
-    """The result, and the most memory that was in use above what was before, GB; 0 where nobody counts it."""
+@dataclass(frozen=True)
+class Observed:
+    """One run of a job that takes seconds, which is a fair sample of its time."""
+
+    image: Tensor
+    seconds: float
+    """Processor time."""
+    peak_gb: float
+    """Most memory in use above what was before; 0 where nobody counts it (Linux does)."""
+    macs: float
+    """Multiply-adds of convolutions and matrix products."""
+
+
+def observed(job: Callable[[], Tensor]) -> Observed:
+    """Runs ``job`` once under all instruments."""
     status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-    if not (status.is_file() and reset.is_file()):
-        return job(), 0.0
-    reset.write_text("5")  # the high-water mark begins at what is in use now
-    before = _memory(status, "VmRSS")
-    result = job()
-    return result, (_memory(status, "VmHWM") - before) / 1e9
+    counts = status.is_file() and reset.is_file()
+    before = _memory(status, "VmRSS") if counts else 0
+    if counts:
+        reset.write_text("5")  # the high-water mark begins at what is in use now
+    with FlopCounterMode(display=False) as counter:
+        start = time.process_time()
+        image = job()
+        seconds = time.process_time() - start
+    peak = _memory(status, "VmHWM") - before if counts else 0
+    return Observed(image, seconds, peak / 1e9, counter.get_total_flops() / 2)
 
 
 def _memory(status: Path, field: str) -> int:

@@ -134,11 +134,19 @@ def code_by_dotted_name(folder: Path) -> Path:
     return with_program(folder, program(b"ctorch._utils\n_rebuild_tensor_v2.__globals__\n"))
 
 
-def attribute_of_a_stand_in(folder: Path) -> Path:
+def changed_function(folder: Path) -> Path:
     """Tries to change what a permitted name stands for: BUILD with a slot state sets attributes."""
     return with_program(
-        folder, program(b"ctorch\nSize\n", b"N}X\x09\x00\x00\x00_functionctorch\nSize\nsX\x00\x00\x00\x00\x86b")
+        folder, program(b"ctorch\nSize\n", b"N}X\x09\x00\x00\x00_functionccollections\nOrderedDict\ns\x86b")
     )
+
+
+def changed_tensor(folder: Path) -> Path:
+    """A tensor that grows after it was checked, to read beyond its storage."""
+    storage = b"(X\x07\x00\x00\x00storagectorch\nFloatStorage\nX\x01\x00\x00\x000X\x03\x00\x00\x00cpuK\x04tQ"
+    tensor = b"ctorch._utils\n_rebuild_tensor_v2\n(" + storage + b"K\x00K\x04\x85K\x01\x85\x89}tR"
+    change = b"}X\x05\x00\x00\x00shapeJ\x00\x00\x00\x10\x85sb"
+    return with_program(folder, program(b"}X\x0a\x00\x00\x00state_dict}X\x01\x00\x00\x00a", tensor, change, b"ss"))
 
 
 def memo_bomb(folder: Path) -> Path:
@@ -262,7 +270,8 @@ CASES: dict[Callable[[Path], Path], str] = {
     code_by_old_instruction: r"instruction INST, which can run code",
     code_through_a_permitted_module: r"holds code \(torch\.load\)",
     code_by_dotted_name: r"holds code",
-    attribute_of_a_stand_in: r"damaged",
+    changed_function: r"tries to change an object",
+    changed_tensor: r"tries to change an object",
     memo_bomb: r"numbers its objects",
     doubling_lists: r"more values",
     huge_tensor: r"claims shape \[268435456\] but its storage has 4 numbers",

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 
-from toonifygb.stylize.styleganex import StyleGANEX, infer_variant
+from toonifygb.stylize.styleganex import StyleGANEX, Variant, infer_variant
 from toonifygb.stylize.styleganex.fast import compile_clip
 
 if TYPE_CHECKING:
@@ -30,7 +30,6 @@ pytestmark = pytest.mark.golden
 EXACT = 1e-5
 """Largest difference in float32: the published program itself is 3.2e-6 away from float64."""
 BF16_DB = 48.0
-LISTINGS = {"styleganex_state_dict.json", "styleganex_state_dict_variants.json"}
 
 
 @dataclass
@@ -41,7 +40,8 @@ class Golden:
 
     def __post_init__(self) -> None:
         self.formulas = runpy.run_path(str(self.folder / "fill_weights.py"))
-        self.tag, self.weights = "", {}
+        self.tag = ""
+        self.weights: dict[tuple[str, tuple[int, ...]], np.ndarray] = {}
 
     @cached_property
     def shapes(self) -> dict[str, dict[str, list]]:
@@ -69,15 +69,16 @@ class Golden:
         """The variant of a set, with the weights of its tag."""
         if meta["tag"] != self.tag:
             self.weights.clear()
-            union = {key: value for listing in self.shapes.values() for key, value in listing.items()}
-            needed = {key: value for key, value in union.items() if "input_label_layer" not in key}
-            self.tag, self.weights = meta["tag"], self.formulas["fill"](needed, meta["tag"])
-        shapes = self.shapes[variant_of(meta["config"], self.shapes)]
+            self.tag = meta["tag"]
         with torch.device("meta"):
-            network = StyleGANEX(infer_variant({key: tuple(value[0]) for key, value in shapes.items()}))
-        weights = {key: torch.from_numpy(self.weights[key]).reshape(value[0]) for key, value in shapes.items()}
+            network = StyleGANEX(variant_of(meta["config"]))
+        shapes = {key: tuple(tensor.shape) for key, tensor in network.state_dict().items()}
+        # A weight depends on tag, key and shape alone, so variants share what they have in common.
+        for key, shape in shapes.items() - self.weights.keys():
+            self.weights[key, shape] = self.formulas["fill_one"](key, shape, shapes, self.tag)
+        weights = {key: torch.from_numpy(self.weights[key, shape]).reshape(shape) for key, shape in shapes.items()}
         network.load_state_dict(weights, assign=True)
-        network.latent_avg = torch.from_numpy(self.formulas["fill_latent_avg"](meta["tag"]))
+        network.latent_avg = torch.from_numpy(self.formulas["fill_latent_avg"](self.tag))
         network.editing_w = torch.zeros(0, 18, 512)
         return network.requires_grad_(False)
 
@@ -96,16 +97,16 @@ class Golden:
         return torch.from_numpy((0.3 * rng.standard_normal((1, 18, 512))).astype(np.float32))
 
 
-def variant_of(config: dict[str, Any], names: dict[str, Any]) -> str:
-    """Listing that belongs to a configuration."""
-    if not config["use_skip"]:
-        return "inversion_noskip"
-    if config.get("use_att"):
-        return "edit_skip7_torgb_att1"
-    layers = config["skip_max_layer"]
-    if layers == 7:
-        return "" if config["use_skip_torgb"] else "toonify_skip7_notorgb"
-    return next(name for name in names if name.startswith("sr") and name.endswith(f"skip{layers}"))
+def variant_of(config: dict[str, Any]) -> Variant:
+    """The variant that the published program builds under these options."""
+    n_fusion = config.get("skip_max_layer", 7) if config["use_skip"] else 0
+    return Variant(
+        input_channels=config.get("input_nc", 3),
+        n_fusion=n_fusion,
+        fuse_rgb=n_fusion == 0 or config.get("use_skip_torgb", True),
+        attention=config.get("use_att", 0) if n_fusion else 0,
+        max_pooling=config.get("max_pooling", False),
+    )
 
 
 @pytest.fixture(scope="module")

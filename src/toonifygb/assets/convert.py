@@ -56,8 +56,17 @@ Describe = Callable[["Checkpoint"], "tuple[Mapping[str, StoredTensor], Mapping[s
 """What a kind of network makes of a checkpoint: the tensors to keep by name, and the metadata."""
 
 
+class _Sealed:
+    """Base of everything a pickle can lay hands on: its instruction BUILD, which sets attributes, ends here."""
+
+    __slots__ = ()
+
+    def __setstate__(self, state: object) -> None:
+        raise AssetError("the checkpoint tries to change an object of the program that reads it", _KEEP_OUT)
+
+
 @dataclass(frozen=True)
-class StoredTensor:
+class StoredTensor(_Sealed):
     """A tensor in a checkpoint: what it claims to be, checked against the file, and where its numbers lie."""
 
     storage: _Storage
@@ -73,9 +82,10 @@ class StoredTensor:
             AssetError: the file is damaged there.
         """
         self.storage.check()
-        flat = np.frombuffer(self.storage.bytes(), self.storage.dtype)[self.offset :]
-        steps = tuple(stride * flat.itemsize for stride in self.strides)
-        view = np.lib.stride_tricks.as_strided(flat, self.shape, steps, writeable=False)
+        dtype = self.storage.dtype
+        steps = [stride * dtype.itemsize for stride in self.strides]
+        # This constructor compares shape and strides with the buffer once more.
+        view = np.ndarray(self.shape, dtype, self.storage.bytes(), self.offset * dtype.itemsize, steps)
         return np.ascontiguousarray(view, np.float32 if view.dtype.kind == "f" else np.int64)
 
 
@@ -88,7 +98,7 @@ class Checkpoint:
 
 
 @dataclass(frozen=True)
-class _Storage:
+class _Storage(_Sealed):
     """A run of numbers in the file."""
 
     dtype: np.dtype
@@ -128,9 +138,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
         raise
     # A damaged pickle fails in any way the interpreter can; all of them mean the same.
     except Exception as error:
-        raise AssetError(
-            f"{path} is damaged or no checkpoint of torch ({type(error).__name__}: {error})", "download it again"
-        ) from error
+        said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise AssetError(f"{path} is damaged or no checkpoint of torch ({said})", "download it again") from error
     if not isinstance(value, dict):
         raise AssetError(f"{path} holds no named tensors; expected a checkpoint of a network")
     return Checkpoint(path, value)
@@ -243,8 +252,8 @@ class _Dtype:
         """Byte order and alignment, which scalars do not need."""
 
 
-class _Call:
-    """A function of ours under a name of the checkpoint's; a pickle cannot change it."""
+class _Call(_Sealed):
+    """A function of ours under a name of the checkpoint's."""
 
     __slots__ = ("_function",)
 
@@ -259,8 +268,7 @@ class _Call:
 def _names() -> dict[tuple[str, str], Any]:
     """Everything a checkpoint may name, and what stands for it.
 
-    No pickle can change what stands here for the next one: functions have no attributes to set, and the one class
-    is new each time.
+    No pickle can change what stands here for the next one: functions are sealed, the one class is new each time.
     """
     scalar, tensor, first = _Call(_scalar), _Call(_tensor), _Call(lambda value, *_: value)
     names = {
@@ -270,7 +278,7 @@ def _names() -> dict[tuple[str, str], Any]:
         ("torch._utils", "_rebuild_parameter"): first,
         ("torch.nn.parameter", "Parameter"): first,
         ("torch", "Size"): _Call(tuple),
-        ("torch", "device"): _Call(lambda *parts: ":".join(str(part) for part in parts)),
+        ("torch", "device"): _Call(lambda kind, *_: kind),
         ("argparse", "Namespace"): type("_Namespace", (_Namespace,), {}),
         ("numpy", "dtype"): _Call(_Dtype),
         ("numpy.core.multiarray", "scalar"): scalar,
@@ -292,7 +300,7 @@ def _tensor(storage: Any, offset: int, size: Any, stride: Any, *_: object) -> St
     if not isinstance(storage, _Storage) or len(shape) != len(strides):
         raise AssetError("a tensor of the checkpoint has no storage or no shape", "download it again")
     if not all(type(number) is int and number >= 0 for number in numbers):
-        raise AssetError(f"a tensor of the checkpoint has shape {list(shape)}", "download it again")
+        raise AssetError("a tensor of the checkpoint has sizes that are no counts", "download it again")
     last = offset + sum((length - 1) * step for length, step in zip(shape, strides, strict=True))
     if math.prod(shape) > storage.length or (0 not in shape and last >= storage.length):
         raise AssetError(

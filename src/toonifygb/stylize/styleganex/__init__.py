@@ -2,7 +2,19 @@
 
 from __future__ import annotations
 
+from toonifygb.stylize.styleganex.fast import ClipNetwork, compile_clip
 from toonifygb.stylize.styleganex.network import StyleGANEX
 from toonifygb.stylize.styleganex.variants import PUBLISHED, Variant, infer_variant
+from toonifygb.stylize.styleganex.weights import convert_checkpoint, load, save
 
-__all__ = ["PUBLISHED", "StyleGANEX", "Variant", "infer_variant"]
+__all__ = [
+    "PUBLISHED",
+    "ClipNetwork",
+    "StyleGANEX",
+    "Variant",
+    "compile_clip",
+    "convert_checkpoint",
+    "infer_variant",
+    "load",
+    "save",
+]

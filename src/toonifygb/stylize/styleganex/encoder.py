@@ -130,7 +130,10 @@ class LabelBlock(nn.Module):
 
 
 class LabelInput(nn.Module):
-    """Input layer for sketches and parsing maps: down to 1/4, residual blocks, up again, then as for RGB."""
+    """Input layer for sketches and parsing maps: down to 1/4, residual blocks, up again, then as for RGB.
+
+    Built from a description and the shapes of its tensors; there are no images of the published program to compare.
+    """
 
     def __init__(self, n_in: int, n_out: int, width: int, n_blocks: int) -> None:
         super().__init__()
@@ -198,8 +201,7 @@ class Encoder(nn.Module):
         """Style codes of an image, without the average latent."""
         taps = self.trunk(x, whole=True)
         c3 = taps.c3
-        if c3 is None:
-            raise AssertionError("the whole trunk has a last feature")
+        assert c3 is not None, "the whole trunk ends in this feature"
         p2 = _enlarged(c3, taps.c2) + self.latlayer1(taps.c2)
         p1 = _enlarged(p2, taps.c1) + self.latlayer2(taps.c1)
         sources = [c3 if code < COARSE else p2 if code < MIDDLE else p1 for code in range(N_CODES)]

@@ -50,6 +50,10 @@ class StyleGANEX(nn.Module):
         self.register_buffer("editing_w", torch.zeros(0, N_CODES, code), persistent=False)
         self.eval()
 
+    def train(self, mode: bool = True) -> StyleGANEX:
+        """Stays in evaluation mode: normalisations use the statistics they were trained with, also in training."""
+        return super().train(False)
+
     def codes(self, x2: Float[Tensor, "n c h w"]) -> Float[Tensor, "n 18 512"]:
         """w+ of an aligned face (256 px as published): E(x2) + average latent."""
         check_image(x2, self.variant.input_channels)
