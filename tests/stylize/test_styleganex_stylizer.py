@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -11,11 +12,13 @@ import pytest
 import stylize_scene as scene
 import torch
 from fake_network import COLORS, FakeNetwork, compile_clip
+from styleganex_weights import NARROW, make_network
 
 from toonifygb import stylize
 from toonifygb.config import PUBLISHED_STYLEGANEX, StyleganexConfig
 from toonifygb.errors import FaceError, InputError
 from toonifygb.stylize.filters import to_lab
+from toonifygb.stylize.styleganex import PUBLISHED, weights
 from toonifygb.stylize.styleganex.aligned import AlignedStylizer
 from toonifygb.stylize.styleganex.engine import Engine, to_bytes, to_network
 from toonifygb.stylize.styleganex.frame import CropRule, crop_rule
@@ -253,3 +256,24 @@ def test_a_misspelt_style_with_weights_is_offered() -> None:
 def test_settings_that_cannot_be_are_named(options: dict, text: str) -> None:
     with pytest.raises(InputError, match=text):
         opened(**options)
+
+
+@pytest.mark.parametrize("framing", ["full", "aligned"])
+def test_the_real_network_runs_by_name(framing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From a file where assets lie to frames, with StyleGANEX at a fraction of its width."""
+    monkeypatch.setenv("TOONIFYGB_CACHE", str(tmp_path))
+    models = tmp_path / "models"
+    models.mkdir()
+    network = make_network(dataclasses.replace(PUBLISHED["toonify"], width=NARROW))
+    weights.save(network, models / "styleganex-arcane.safetensors")
+    (models / "styleganex-arcane.json").write_text("{}")
+    frames, marks = scene.frames(3, 96, 80, shift_px=1), scene.landmarks(3, 96, 80, shift_px=1)
+    options = StyleganexConfig(framing=framing, levels=6)
+    style = stylize.get("arcane", options)
+    state = stylize.prepare(iter(frames), marks, style)
+    whole = list(stylize.stylize_frames(iter(frames), marks, style, state))
+    assert [frame.shape for frame in whole] == [frame.shape for frame in frames]
+    assert np.abs(whole[0].astype(float) - frames[0]).max() > 20
+    again = stylize.stylize_frames(iter(frames), marks, stylize.get("arcane", options), state, chunk=1, start=2)
+    assert np.array_equal(next(again), whole[2])
+    assert stylize.files("arcane") == (models / "styleganex-arcane.safetensors",)
