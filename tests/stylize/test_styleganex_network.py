@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from typing import TYPE_CHECKING
 
 import pytest
 import torch
 from styleganex_weights import NARROW, make_network
 
-from toonifygb.errors import AssetError, InputError
+from toonifygb.errors import AssetError, BackendError, InputError
 from toonifygb.stylize.styleganex import PUBLISHED, StyleGANEX, Variant, infer_variant, layers
 from toonifygb.stylize.styleganex.encoder import StyleHead
 from toonifygb.stylize.styleganex.fast import compile_clip
@@ -154,8 +155,16 @@ def test_the_clip_network_keeps_no_head_and_outlives_the_plain_one(toonify: Styl
     assert kept < 0.4 * sum(parameter.numel() for parameter in network.parameters())
 
 
+def test_compiling_needs_a_compiler(toonify: StyleGANEX, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    with pytest.raises(BackendError, match=r"needs a C\+\+ compiler"):
+        compile_clip(toonify, toonify.latent_avg[None], compiled=True)
+
+
 @pytest.mark.slow
 def test_compiled_is_the_same_network(toonify: StyleGANEX) -> None:
+    if not shutil.which("g++"):
+        pytest.skip("no C++ compiler (g++)")
     frame = picture(toonify)
     with torch.no_grad():
         w_plus = toonify.codes(frame)

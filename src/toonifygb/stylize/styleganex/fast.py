@@ -54,7 +54,8 @@ def compile_clip(
             multiplies in it (AMX, AVX-512 BF16), and twice as slow where it does not.
         levels: 8 for an output of 4 times the input's size, 7 for 2 times, 6 for the same size.
         edit: editing vector, as in ``synthesize``.
-        compiled: have torch compile the whole; some 20 s for each new size of frame, so for long clips.
+        compiled: have torch compile the whole, which takes 20 s to minutes for each new size of frame. Worth trying
+            on long clips with bfloat16; in float32 the convolutions are all that is left, and they stay the same.
 
     Raises:
         InputError: codes for other than one clip, or a precision or level that does not exist.
