@@ -17,6 +17,7 @@ from toonifygb.errors import InputError
 
 Quality = Literal["draft", "standard", "paper"]
 TrackOn = Literal["auto", "original", "stylized"]
+Framing = Literal["auto", "full", "crop", "published", "aligned"]
 
 
 @dataclass(frozen=True)
@@ -24,9 +25,46 @@ class StylizeConfig:
     """Stage 1: how each frame is stylised."""
 
     style: str = "toon"
-    """Built-in style: toon, paint, ink or none."""
+    """toon, paint, ink or none; a style with weights of its own (arcane, cartoon, pixar); or a model file, .onnx
+    or .ts."""
     strength: float = 1.0
     """Blend between the original (0) and the full style (1)."""
+
+
+@dataclass(frozen=True)
+class StyleganexConfig:
+    """The styles that run StyleGANEX: arcane, cartoon, pixar."""
+
+    framing: Framing = "auto"
+    """What goes through the network: full (the whole frame), crop (the surroundings of the face, blended into the
+    frame), auto (full unless the face is so small in the frame that it would take several GB), published (the crop
+    of the authors' procedure), or aligned (the upright face alone, frame by frame: the paper's comparison)."""
+    codes: Literal["best", "first", "each"] = "best"
+    """Frame whose face the style codes are read from: best (frontal, sharp, eyes open), first, or each (only with
+    aligned framing)."""
+    size: Literal["source", "super"] = "source"
+    """source: frames of the clip's size; super: the network's own, larger output, which stage 1 alone can write."""
+    own_colors: float = 1.0
+    """Codes of colour and texture: this face's own (1), the style's average (0), or between."""
+    source_color: float = 0.0
+    """How much of the source's broad colours is put back, 0..1."""
+    calm: bool = True
+    """Take sensor noise out of the source first, which keeps the result from boiling."""
+    rounding: Literal["nearest", "truncate"] = "nearest"
+    """How the network's colours become bytes; truncate is the authors' and darkens by half a level."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """bfloat16 is about twice as fast on processors that multiply in it, and differs by half a level on average."""
+    levels: int = 8
+    """Generator levels run: 8 for an output of 4 times the input's size, 7 for twice, 6 for the same; fewer are
+    faster and softer."""
+    device: str = "auto"
+    """Where the network runs: cpu, cuda, or auto (cuda where there is one)."""
+
+
+PUBLISHED_STYLEGANEX = StyleganexConfig(
+    framing="published", codes="first", size="super", calm=False, rounding="truncate"
+)
+"""The authors' video procedure, for comparison."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +142,7 @@ class RunConfig:
     quality: Quality = "standard"
     """draft: minutes; standard: a coffee; paper: the published regime."""
     stylize: StylizeConfig = field(default_factory=StylizeConfig)
+    styleganex: StyleganexConfig = field(default_factory=StyleganexConfig)
     face: FaceConfig = field(default_factory=FaceConfig)
     track: TrackConfig = field(default_factory=TrackConfig)
     train: TrainConfig = field(default_factory=TrainConfig)

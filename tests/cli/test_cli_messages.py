@@ -29,10 +29,10 @@ def pattern(size: tuple[int, int], seed: int) -> np.ndarray:
     return cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC)
 
 
-def write_clip(path: Path, n_frames: int) -> Path:
+def write_clip(path: Path, n_frames: int, first_seed: int = 0) -> Path:
     with video.Writer(path, 128, 96, 25) as writer:
         for index in range(n_frames):
-            writer.write(pattern((128, 96), index))
+            writer.write(pattern((128, 96), first_seed + index))
     return path
 
 
@@ -63,7 +63,13 @@ def unknown_style(folder: Path) -> list[str]:
 
 
 def no_face(folder: Path) -> list[str]:
-    return ["create", str(write_clip(folder / "clip.mp4", 6)), "--out", str(folder / "run"), "--quiet"]
+    return [
+        "create",
+        str(write_clip(folder / "clip.mp4", 6, first_seed=20)),
+        "--out",
+        str(folder / "run"),
+        "--quiet",
+    ]
 
 
 def unknown_setting(folder: Path) -> list[str]:

@@ -75,6 +75,7 @@ def test_a_run_leaves_what_it_promises(finished: Path) -> None:
     assert values["lpips"] is None
     assert values["itf"] > 15
     assert 0 < values["isi"] <= 1
+    assert 0 < values["warping_error"] < 0.1
     assert values["peak_memory_mb"] > 50
     for stage in ("landmarks", "stylize", "track", "dataset", "train", "scores", "preview"):
         assert values["seconds"][stage] >= 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from toonifygb.cli.assets import assets
 from toonifygb.cli.progress import Terminal
 from toonifygb.config import PRESETS, FaceConfig, Quality, RunConfig, StylizeConfig, TrackConfig, TrackOn, override
 
@@ -33,7 +34,7 @@ def create(
     Args:
         clip: Video file or folder of images with one person's head.
         out: Folder of the run; runs/<clip name>-<style> when unset.
-        style: Built-in style: toon, paint, ink or none.
+        style: toon, paint, ink or none; arcane, cartoon or pixar (assets get styleganex-...); or a model file.
         quality: draft (minutes), standard, or paper (the published regime).
         strength: Blend between the original (0) and the full style (1).
         track_on: Video whose landmarks the head model is fitted to.
@@ -54,7 +55,7 @@ def create(
         backend=backend,
         threads=threads,
     )
-    _create(clip, out or Path("runs") / f"{clip.stem}-{style}", _with(run_config, settings), quiet)
+    _create(clip, out or Path("runs") / f"{clip.stem}-{Path(style).stem}", _with(run_config, settings), quiet)
 
 
 def demo(
@@ -64,7 +65,7 @@ def demo(
 
     Args:
         out: Folder of the run.
-        style: Built-in style: toon, paint, ink or none.
+        style: toon, paint, ink or none; arcane, cartoon or pixar (assets get styleganex-...); or a model file.
         n_frames: Length of the synthetic clip.
         seed: Which synthetic person.
         quiet: Say nothing but errors.
@@ -87,17 +88,19 @@ def stylize(
     strength: float = 1.0,
     choose_face: str = "largest",
     max_frames: int | None = None,
+    settings: tuple[str, ...] = (),
     quiet: bool = False,
 ) -> None:
-    """Stage 1 alone: a clip in a style, with its size, pace and sound.
+    """Stage 1 alone: a clip in a style, with its size, pace and sound. The same line resumes a stopped one.
 
     Args:
         clip: Video file or folder of images.
         out: Video file to write (.mp4).
-        style: Built-in style: toon, paint, ink or none.
+        style: toon, paint, ink or none; arcane, cartoon or pixar (assets get styleganex-...); or a model file.
         strength: Blend between the original (0) and the full style (1).
         choose_face: Which face to follow where several are visible.
         max_frames: Use only the first frames.
+        settings: Any other setting by name, for instance styleganex.size=super.
         quiet: Say nothing but errors.
     """
     from toonifygb.pipeline.single import stylize_file
@@ -107,7 +110,7 @@ def stylize(
         face=FaceConfig(choose=choose_face),
         max_frames=max_frames,
     )
-    stylize_file(clip, out, run_config, _terminal(quiet))
+    stylize_file(clip, out, _with(run_config, settings), _terminal(quiet))
 
 
 def track(
@@ -231,6 +234,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "track": track,
     "train": train,
     "render": render,
+    "assets": assets,
     "doctor": doctor,
 }
 

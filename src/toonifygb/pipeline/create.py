@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,7 +21,8 @@ from toonifygb.config import from_json, to_json
 from toonifygb.errors import FaceError, InputError
 from toonifygb.pipeline.files import LANDMARK_TRACK, load_landmarks, save_landmarks
 from toonifygb.pipeline.outcome import outcome
-from toonifygb.pipeline.source import Source
+from toonifygb.pipeline.segments import SEGMENT, Segments
+from toonifygb.pipeline.source import Source, open_style, style_inputs
 from toonifygb.pipeline.stages import STATE_FILE
 from toonifygb.structures import Landmarks, TrackedSequence
 
@@ -43,6 +44,7 @@ def create(source: Source, run: Run, config: RunConfig) -> None:
         FaceError: no usable face in the clip.
         Stopped: the user asked to stop; calling again goes on.
     """
+    check_size(config)
     remember_request(source, run, config)
     fitted, styled = track_stages(source, run, config)
     check_trainable(run, source)
@@ -51,6 +53,19 @@ def create(source: Source, run: Run, config: RunConfig) -> None:
     draw_overlay(source, run, tracked, styled)
     trained = train_avatar(run, config, cut, tracked)
     outcome(source, run, config, trained)
+
+
+def check_size(config: RunConfig) -> None:
+    """Refuses settings under which stylised frames do not lie on the filmed ones.
+
+    Raises:
+        InputError: enlarged frames.
+    """
+    if config.styleganex.size != "source":
+        raise InputError(
+            f"setting styleganex.size is '{config.styleganex.size}'; an avatar needs frames of the clip's own size",
+            "leave it at source, or write the larger video alone with: toonifygb stylize",
+        )
 
 
 def track_only(source: Source, run: Run, config: RunConfig) -> None:
@@ -118,18 +133,14 @@ def find_landmarks(source: Source, run: Run, config: RunConfig) -> str:
 def stylize_clip(source: Source, run: Run, config: RunConfig, found: str) -> str:
     """Stage 1: every frame in the chosen style, with the source's sound, size and pace."""
     out = run.file("stylized.mp4")
+    inputs = [found, *style_inputs(config), config.max_frames]
 
     def work(progress: Progress) -> None:
         landmarks = load_landmarks(run.work("landmarks.safetensors"))
-        write_stylized(source, out, config, landmarks, progress)
+        segments = Segments(run.work("stylize"), *inputs)
+        write_stylized(source, out, config, landmarks, segments, progress)
 
-    return run.stage(
-        "stylize",
-        f"stylising ({config.stylize.style})",
-        inputs=[found, config.stylize, config.max_frames],
-        outputs=[out],
-        work=work,
-    )
+    return run.stage("stylize", f"stylising ({config.stylize.style})", inputs=inputs, outputs=[out], work=work)
 
 
 def write_stylized(
@@ -137,23 +148,23 @@ def write_stylized(
     out: Path,
     config: RunConfig,
     landmarks: Landmarks,
+    segments: Segments,
     progress: Progress,
 ) -> None:
-    """Streams the clip through its style into ``out``."""
-    stylizer = stylize.get(config.stylize.style)
+    """Streams the clip through its style into ``out``, from where an earlier attempt was interrupted."""
+    stylizer = open_style(config)
     strength = config.stylize.strength
-    n = landmarks.points.shape[0]
+
+    def prepare() -> dict[str, Any]:
+        with closing(source.frames(config)) as frames:
+            return stylize.prepare(frames, landmarks, stylizer, strength=strength)
+
+    state = segments.state(prepare)
+    start = len(segments.finished()) * SEGMENT
     with closing(source.frames(config)) as frames:
-        state = stylize.prepare(frames, landmarks, stylizer, strength=strength)
-    info = source.info
-    with (
-        video.Writer(out, info.width, info.height, info.fps, audio_from=source.path) as writer,
-        closing(source.frames(config)) as frames,
-    ):
-        styled = stylize.stylize_frames(frames, landmarks, stylizer, state, strength=strength)
-        for done, frame in enumerate(styled, start=1):
-            writer.write(frame)
-            progress.update(done, n)
+        styled = stylize.stylize_frames(frames, landmarks, stylizer, state, strength=strength, start=start)
+        segments.write(styled, source.info.fps, progress, landmarks.points.shape[0])
+    segments.join(out, source)
 
 
 def choose_landmarks(run: Run, config: RunConfig, found: str, styled: str) -> str:
@@ -164,7 +175,7 @@ def choose_landmarks(run: Run, config: RunConfig, found: str, styled: str) -> st
 
     def work(progress: Progress) -> None:
         original = load_landmarks(run.work("landmarks.safetensors"))
-        stylizer = stylize.get(config.stylize.style)
+        stylizer = open_style(config)
         carried = stylize.warp_landmarks(original, stylizer, config.stylize.strength)
         choice, reason, chosen = "original", "", carried
         if config.track.on != "original" and config.stylize.style != "none":
@@ -279,7 +290,7 @@ def cut_dataset(source: Source, run: Run, config: RunConfig, fitted: str, styled
         model = head.load("open")
         frames = (f[: source.info.height, : source.info.width] for f in video.read(run.file("stylized.mp4")))
         landmarks = load_landmarks(run.work("landmarks.safetensors"))
-        stylizer = stylize.get(config.stylize.style)
+        stylizer = open_style(config)
         photos = stylize.warp_frames(source.frames(config), landmarks, stylizer, config.stylize.strength)
         pairs = head_frames(photos, frames, sequence, model)
         train.build_dataset(pairs, sequence, model, config.train, out, progress=progress)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
-from safetensors import SafetensorError, safe_open
+import numpy as np
+from safetensors import SafetensorError, numpy, safe_open
 from safetensors.torch import save_file
 
 from toonifygb.atomic import replacing
@@ -37,3 +39,28 @@ def load_landmarks(path: Path) -> Landmarks:
             return Landmarks(file.get_tensor("points"), file.get_tensor("score"), width, height)
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} does not hold landmarks ({error})", "delete it and run again") from error
+
+
+def save_state(state: dict[str, Any], path: Path) -> None:
+    """Writes what a style keeps of a clip, numbers and arrays, exactly."""
+    temporary = path.with_name(f".{path.name}.part")
+    arrays = {name: np.ascontiguousarray(value) for name, value in state.items() if isinstance(value, np.ndarray)}
+    plain = {name: value for name, value in state.items() if name not in arrays}
+    numpy.save_file(arrays, temporary, metadata={"plain": json.dumps(plain)})
+    os.replace(temporary, path)
+
+
+def load_state(path: Path) -> dict[str, Any]:
+    """The state from ``save_state``.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    try:
+        with safe_open(path, framework="np") as file:
+            plain = json.loads(file.metadata()["plain"])
+            return plain | {name: file.get_tensor(name) for name in file.keys()}
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path} does not hold the state of a style ({error})", "delete it and run again"
+        ) from error

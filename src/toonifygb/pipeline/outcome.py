@@ -7,13 +7,14 @@ import json
 import math
 import platform
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
-from toonifygb import __version__, head, metrics, track, train, video
+from toonifygb import __version__, head, metrics, stylize, track, train, video
 from toonifygb import avatar as avatars
 from toonifygb.atomic import replacing
 from toonifygb.pipeline import pictures
@@ -66,10 +67,19 @@ def score(source: Source, run: Run, config: RunConfig, trained: str) -> str:
         held_out |= {f"{name}_landmark_pose": driven[name] for name in ("psnr", "ssim")}
         refined_error = track.landmark_errors(sequence, head.load(sequence.head_model))
         held_out["landmark_error_refined_px"] = float(refined_error[sequence.tracked].mean())
-        steadiness = metrics.stability(video.read(run.file("stylized.mp4")))
-        write_json(out, {**held_out, "itf": steadiness.itf, "isi": steadiness.isi})
+        styled = run.file("stylized.mp4")
+        steadiness = metrics.stability(video.read(styled))
+        with closing(source.frames(config)) as filmed:
+            warping = stylize.warping_error(filmed, _cropped(video.read(styled), source))
+        steady = {"itf": steadiness.itf, "isi": steadiness.isi, "warping_error": warping}
+        write_json(out, {**held_out, **steady})
 
     return run.stage("scores", "judging on held-out frames", inputs=[trained], outputs=[out], work=work)
+
+
+def _cropped(frames: Iterator[np.ndarray], source: Source) -> Iterator[np.ndarray]:
+    """Frames without the row or column that an odd size gains in the file."""
+    yield from (frame[: source.info.height, : source.info.width] for frame in frames)
 
 
 def make_preview(source: Source, run: Run, config: RunConfig, trained: str) -> str:
@@ -217,6 +227,7 @@ def report_page(source: Source, run: Run, config: RunConfig, values: dict[str, A
         ("tracked video", values["track_on"]),
         ("PSNR with the head pose of the landmarks alone", f"{values['psnr_landmark_pose']:.2f} dB"),
         ("ISI", f"{values['isi']:.4f}"),
+        ("warping error of the stylised video", f"{values['warping_error']:.4f}"),
         ("peak memory", f"{values['peak_memory_mb']:.0f} MB"),
         *((name, str(version)) for name, version in values["versions"].items()),
     ]

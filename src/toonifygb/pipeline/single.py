@@ -13,7 +13,8 @@ from toonifygb import avatar as avatars
 from toonifygb import face, track, video
 from toonifygb.errors import FaceError, InputError
 from toonifygb.pipeline.create import write_stylized
-from toonifygb.pipeline.source import open_source
+from toonifygb.pipeline.segments import Segments
+from toonifygb.pipeline.source import open_source, style_inputs
 from toonifygb.pipeline.viewing import AvatarViewer, parse_color, posed
 from toonifygb.structures import Landmarks
 
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 def stylize_file(clip: Path, out: Path, config: RunConfig, reporter: Reporter) -> None:
     """Writes ``clip`` in its style to ``out``; a clip without a face is stylised without the face's touches.
+
+    Finished stretches wait in a folder ``.parts`` beside ``out``: the same call goes on with it after a stop.
 
     Raises:
         InputError: the clip, the style or the output cannot be used.
@@ -46,7 +49,9 @@ def stylize_file(clip: Path, out: Path, config: RunConfig, reporter: Reporter) -
     for sentence in [*opened.problems, *problems]:
         reporter.note(sentence)
     progress = reporter.stage("stylize", f"stylising ({config.stylize.style})")
-    write_stylized(source, out, config, landmarks, progress)
+    inputs = [source.sha256, config.face, *style_inputs(config), config.max_frames]
+    segments = Segments(out.with_suffix(".parts"), *inputs)
+    write_stylized(source, out, config, landmarks, segments, progress)
 
 
 def _no_landmarks(width: int, height: int, n_frames: int) -> Landmarks:

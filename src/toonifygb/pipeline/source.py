@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from toonifygb.structures import VideoInfo
 
 if TYPE_CHECKING:
     from toonifygb.config import RunConfig
+    from toonifygb.stylize import Stylizer
 
 
 @dataclass(frozen=True)
@@ -41,5 +42,16 @@ def open_source(clip: Path, config: RunConfig) -> Source:
         InputError: no such file, not a video, no frames, or an unknown style.
     """
     info = video.probe(clip)
-    stylize.get(config.stylize.style)
+    open_style(config)
     return Source(clip, info, video.source_sha256(clip))
+
+
+def open_style(config: RunConfig) -> Stylizer:
+    """The style a run asks for; raises as ``stylize.get``."""
+    return stylize.get(config.stylize.style, config.styleganex)
+
+
+def style_inputs(config: RunConfig) -> list[Any]:
+    """What decides a style's frames beside the clip: its settings, and the checksums of the files it reads."""
+    files = [video.source_sha256(path) for path in stylize.files(config.stylize.style)]
+    return [config.stylize, *([config.styleganex, *files] if files else [])]

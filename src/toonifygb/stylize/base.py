@@ -9,9 +9,13 @@ it what is common to all styles: it calms sensor noise, warps the face, and blen
 from __future__ import annotations
 
 import difflib
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from toonifygb.config import StyleganexConfig
 from toonifygb.errors import InputError
+from toonifygb.stylize import plugin
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -52,11 +56,25 @@ class Stylizer(Protocol):
         mattes: Float[np.ndarray, "t h w"] | None,
         state: dict[str, Any],
     ) -> UInt8[np.ndarray, "t h w 3"]:
-        """The frames in this style, same size and count; independent of what was applied before."""
+        """The frames in this style, same count and size; independent of what was applied before.
+
+        A style may be set to give larger frames; these can be neither blended with the source nor made an avatar.
+        """
         ...
 
 
 _FACTORIES: dict[str, Callable[[], Stylizer]] = {}
+_WITH_WEIGHTS: dict[str, WeightedStyle] = {}
+
+
+@dataclass(frozen=True)
+class WeightedStyle:
+    """A style that works once its weights are there."""
+
+    open: Callable[[StyleganexConfig], Stylizer]
+    """The style; raises InputError, saying how to get them, where its weights are missing."""
+    weights: Callable[[], Path | None]
+    """File of its weights, if it is there."""
 
 
 def register(name: str, factory: Callable[[], Stylizer]) -> None:
@@ -64,21 +82,43 @@ def register(name: str, factory: Callable[[], Stylizer]) -> None:
     _FACTORIES[name] = factory
 
 
+def register_weighted(name: str, style: WeightedStyle) -> None:
+    """Makes ``get(name)`` open a style whose weights do not come with the package."""
+    _WITH_WEIGHTS[name] = style
+
+
 def available() -> tuple[str, ...]:
     """Names of the styles that work without further files."""
     return tuple(sorted(_FACTORIES))
 
 
-def get(name: str) -> Stylizer:
-    """The style of that name.
+def get(name: str, options: StyleganexConfig | None = None) -> Stylizer:
+    """The style of that name; the network of a weighted style is not read before it is used.
+
+    Args:
+        name: of a style, or path of a model file (``.onnx``, ``.ts``, ``.torchscript``; see ``plugin``).
+        options: settings of the styles that run StyleGANEX.
 
     Raises:
-        InputError: no such style; the nearest name is offered.
+        InputError: no such style (the nearest name is offered), its weights are missing, or its file is no model
+            that can be used.
     """
     if name in _FACTORIES:
         return _FACTORIES[name]()
-    near = difflib.get_close_matches(name, available(), n=1, cutoff=0.0)
+    if name in _WITH_WEIGHTS:
+        return _WITH_WEIGHTS[name].open(options or StyleganexConfig())
+    if plugin.is_model_file(name):
+        return plugin.open_model(Path(name))
+    near = difflib.get_close_matches(name, (*available(), *_WITH_WEIGHTS), n=1, cutoff=0.0)
     raise InputError(
         f"style '{name}' does not exist; available: {', '.join(available())}",
         f"did you mean '{near[0]}'?" if near else "",
     )
+
+
+def files(name: str) -> tuple[Path, ...]:
+    """Files a style reads beside the package: what its frames depend on beside the settings."""
+    if name in _WITH_WEIGHTS:
+        weights = _WITH_WEIGHTS[name].weights()
+        return () if weights is None else (weights,)
+    return plugin.model_files(Path(name)) if plugin.is_model_file(name) else ()

@@ -73,6 +73,7 @@ def stylize_frames(
     strength: float = 1.0,
     mattes: Iterable[Matte] | None = None,
     chunk: int = 8,
+    start: int = 0,
 ) -> Iterator[Frame]:
     """The clip in the given style, frame by frame.
 
@@ -84,17 +85,22 @@ def stylize_frames(
         strength: 0 gives the frames back bit for bit; between, geometry and colour are blended together.
         mattes: person mattes beside the frames.
         chunk: frames handed to the style at once; changes memory, never the result.
+        start: first frame to deliver; those before it are read and passed over, the rest is as it would have been.
 
     Raises:
-        InputError: ``strength`` outside 0..1, or more frames than landmarks.
+        InputError: ``strength`` outside 0..1, more frames than landmarks, or a partial strength of a style that
+            changes the size of the frames.
     """
     amount = stylizer.exaggeration.scaled(_checked(strength))
     faces = follow(landmarks)
     pairs = _counted(frames, mattes, len(faces))
     if strength == 0:
-        yield from (frame for _, frame, _ in pairs)
+        yield from (frame for index, frame, _ in pairs if index >= start)
         return
-    source = _calmed(pairs) if stylizer.denoise else ((*each, each[1]) for each in pairs)
+    reach = steady.RADIUS if stylizer.denoise else 0
+    near = (each for each in pairs if each[0] >= start - reach)
+    calm = _calmed(near) if stylizer.denoise else ((*each, each[1]) for each in near)
+    source = (each for each in calm if each[0] >= start)
     while batch := list(islice(source, max(1, chunk))):
         indices = [index for index, *_ in batch]
         planes = None if mattes is None else [matte for _, _, matte, _ in batch if matte is not None]
@@ -167,8 +173,9 @@ def _calmed(
 ) -> Iterator[tuple[int, Frame, Matte | None, Frame]]:
     """Each frame with its calmed version appended; reads ``steady.RADIUS`` frames ahead."""
     window: deque[tuple[int, Frame, Matte | None]] = deque(maxlen=2 * steady.RADIUS + 1)
-    done = 0  # number of the next frame to hand on
+    done = -1  # number of the next frame to hand on
     for item in pairs:
+        done = item[0] if done < 0 else done
         window.append(item)
         if item[0] - done == steady.RADIUS:
             yield _calmed_item(window, done)
@@ -205,5 +212,10 @@ def _warp_frame(image: np.ndarray, faces: Faces, index: int, amount: Exaggeratio
 
 
 def _blend(original: Frame, drawn: Frame, strength: float) -> Frame:
+    if original.shape != drawn.shape:
+        raise InputError(
+            f"strength {strength:g} blends frames with the source, and this style makes frames of another size",
+            "use strength 1, or a setting of the style that keeps the size",
+        )
     mixed = original.astype(np.float32) * np.float32(1.0 - strength) + drawn * np.float32(strength)
     return np.rint(mixed).astype(np.uint8)

@@ -2,6 +2,7 @@
 
 from toonifygb.video.checksum import source_sha256
 from toonifygb.video.encoder import has_encoder
+from toonifygb.video.join import join
 from toonifygb.video.read import Clip, open_clip, probe, read
 from toonifygb.video.still import encode_jpeg, load_image, save_png
 from toonifygb.video.write import Writer
@@ -11,6 +12,7 @@ __all__ = [
     "Writer",
     "encode_jpeg",
     "has_encoder",
+    "join",
     "load_image",
     "open_clip",
     "probe",

@@ -146,6 +146,9 @@ class Writer:
             "crf": _QUALITY,
             "preset": "medium",
             "rc-lookahead": str(max(4, min(40, _LOOKAHEAD_BYTES // frame_bytes))),
+            # x264's macroblock tree does not give the same bytes every time (seen with its AVX-512 code, on
+            # drifting patterns); a resumed run must end with the same file as an uninterrupted one.
+            "x264-params": "mbtree=0",
         }
         stream = self._container.add_stream("libx264", rate=self._rate, options=options)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"

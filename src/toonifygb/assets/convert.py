@@ -1,0 +1,402 @@
+"""From a checkpoint of torch (``.pt``) to safetensors, without running any of the code that a checkpoint can hold.
+
+The only file of the package that unpickles. A checkpoint is a pickle, a small program that builds objects, beside
+raw numbers. Here the program is first read as a list of instructions and measured (``_inspect``); then it is run by
+an unpickler that knows nothing but the names in ``_names``, each of which stands for something of ours: a tensor
+becomes a ``StoredTensor``, a note of where its numbers lie. Numbers are touched only when they are written.
+
+Both layouts of ``torch.save`` are read: the zip archive (since torch 1.6) and the older single stream.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import mmap
+import os
+import pickle
+import pickletools
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from toonifygb.assets.archive import StoredArchive
+from toonifygb.errors import AssetError
+from toonifygb.progress import SILENT
+
+if TYPE_CHECKING:
+    from toonifygb.progress import Progress
+
+_STORAGES = {
+    "FloatStorage": "<f4",
+    "DoubleStorage": "<f8",
+    "HalfStorage": "<f2",
+    "LongStorage": "<i8",
+    "IntStorage": "<i4",
+    "ShortStorage": "<i2",
+    "CharStorage": "<i1",
+    "ByteStorage": "<u1",
+    "BoolStorage": "?",
+}
+"""Numbers behind torch's storage classes."""
+_NUMPY_SCALARS = {"f8": "<f8", "f4": "<f4", "i8": "<i8", "i4": "<i4", "b1": "?"}
+_MOST_PICKLE_BYTES = 32 * 2**20
+"""A network of 2000 tensors needs less than one."""
+_MOST_VALUES, _MOST_DEPTH = 200_000, 32
+_LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
+_LEGACY_PROTOCOL = 1001
+_ZIP_START = b"PK\x03\x04"
+_KEEP_OUT = "do not open this file with other programs; use the file that the authors publish"
+Describe = Callable[["Checkpoint"], "tuple[Mapping[str, StoredTensor], Mapping[str, str]]"]
+"""What a kind of network makes of a checkpoint: the tensors to keep by name, and the metadata."""
+
+
+class _Sealed:
+    """Base of everything a pickle can lay hands on: its instruction BUILD, which sets attributes, ends here."""
+
+    __slots__ = ()
+
+    def __setstate__(self, state: object) -> None:
+        raise AssetError("the checkpoint tries to change an object of the program that reads it", _KEEP_OUT)
+
+
+@dataclass(frozen=True)
+class StoredTensor(_Sealed):
+    """A tensor in a checkpoint: what it claims to be, checked against the file, and where its numbers lie."""
+
+    storage: _Storage
+    offset: int
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+    """In elements."""
+
+    def array(self) -> np.ndarray:
+        """The numbers: float32 for anything with a fraction, int64 for the rest; native byte order, contiguous.
+
+        Raises:
+            AssetError: the file is damaged there.
+        """
+        self.storage.check()
+        dtype = self.storage.dtype
+        steps = [stride * dtype.itemsize for stride in self.strides]
+        # This constructor compares shape and strides with the buffer once more.
+        view = np.ndarray(self.shape, dtype, self.storage.bytes(), self.offset * dtype.itemsize, steps)
+        return np.ascontiguousarray(view, np.float32 if view.dtype.kind == "f" else np.int64)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What ``torch.save`` was given, as plain dicts, lists, strings, numbers and ``StoredTensor``."""
+
+    path: Path
+    values: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Storage(_Sealed):
+    """A run of numbers in the file."""
+
+    dtype: np.dtype
+    length: int
+    bytes: Callable[[], memoryview]
+    check: Callable[[], None]
+
+
+def convert(source: Path, target: Path, describe: Describe, *, progress: Progress = SILENT) -> None:
+    """Writes the tensors that ``describe`` selects from checkpoint ``source`` to the safetensors file ``target``.
+
+    ``target`` appears when it is complete; after an error nothing is left behind.
+
+    Raises:
+        AssetError: ``source`` is damaged, holds code or things that no network needs, or is not what ``describe``
+            expects.
+    """
+    tensors, metadata = describe(read_checkpoint(source))
+    write_safetensors(target, tensors, metadata, source=source, progress=progress)
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """Everything in a checkpoint but the numbers, which stay in the file until they are asked for.
+
+    Raises:
+        AssetError: the file is absent, damaged, or holds more than tensors and plain values.
+    """
+    if not path.is_file():
+        raise AssetError(f"{path} does not exist; expected a checkpoint (.pt)", "check the path")
+    if path.stat().st_size == 0:
+        raise AssetError(f"{path} is empty", "download it again")
+    with path.open("rb") as file:
+        data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    try:
+        value = (_read_archive if data[:4] == _ZIP_START else _read_stream)(data, path)
+    except AssetError:
+        raise
+    # A damaged pickle fails in any way the interpreter can; all of them mean the same.
+    except Exception as error:
+        said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise AssetError(f"{path} is damaged or no checkpoint of torch ({said})", "download it again") from error
+    if not isinstance(value, dict):
+        raise AssetError(f"{path} holds no named tensors; expected a checkpoint of a network")
+    return Checkpoint(path, value)
+
+
+def _read_archive(data: memoryview, path: Path) -> Any:
+    """The value in a zip archive."""
+    archive = StoredArchive(data, path)
+    pickles = [name for name in archive.names() if name == "data.pkl" or name.endswith("/data.pkl")]
+    if len(pickles) != 1:
+        raise AssetError(f"{path} is a zip archive without a checkpoint of torch inside")
+    folder = pickles[0].removesuffix("data.pkl")
+    order = f"{folder}byteorder"
+    if order in archive.names() and bytes(archive.view(order)) != b"little":
+        raise AssetError(f"{path} was written on a machine with another byte order")
+    archive.check(pickles[0])
+
+    def storage(kind: str, key: str, length: int) -> _Storage:
+        name, dtype = f"{folder}data/{key}", np.dtype(_STORAGES[kind])
+        if len(archive.view(name)) != length * dtype.itemsize:
+            raise AssetError(
+                f"{path} is damaged: storage {key} has {len(archive.view(name))} bytes for {length} numbers of "
+                f"{dtype.itemsize}",
+                "download it again",
+            )
+        return _Storage(dtype, length, lambda: archive.view(name), lambda: archive.check(name))
+
+    program = archive.view(pickles[0])
+    return _run(program[: _inspect(program, path)], storage, path)
+
+
+def _read_stream(data: memoryview, path: Path) -> Any:
+    """The value in the older layout: five pickles in a row, then length and numbers of each storage."""
+    lengths: dict[str, tuple[str, int]] = {}
+    places: dict[str, int] = {}
+
+    def storage(kind: str, key: str, length: int) -> _Storage:
+        if lengths.setdefault(key, (kind, length)) != (kind, length):
+            raise AssetError(f"{path} is damaged: storage {key} has two sizes")
+        dtype = np.dtype(_STORAGES[kind])
+
+        def content() -> memoryview:
+            return data[places[key] : places[key] + length * dtype.itemsize]
+
+        return _Storage(dtype, length, content, lambda: None)
+
+    values, start = [], 0
+    for _ in range(5):
+        end = start + _inspect(data[start : start + _MOST_PICKLE_BYTES], path)
+        values.append(_run(data[start:end], storage, path))
+        start = end
+    magic, protocol, _, value, keys = values
+    if (magic, protocol) != (_LEGACY_MAGIC, _LEGACY_PROTOCOL) or set(keys) != set(lengths):
+        raise AssetError(f"{path} is no checkpoint of torch")
+    for key in keys:
+        kind, length = lengths[key]
+        size = length * np.dtype(_STORAGES[kind]).itemsize
+        if start + 8 + size > len(data) or int.from_bytes(data[start : start + 8], "little") != length:
+            raise AssetError(f"{path} is damaged or cut short at storage {key}", "download it again")
+        places[key], start = start + 8, start + 8 + size
+    return value
+
+
+def _inspect(program: memoryview, path: Path) -> int:
+    """Length of the pickle at the start of ``program``, whose instructions are looked at but not run.
+
+    Raises:
+        AssetError: it names anything beyond the names we know, or asks for more memory than it can fill.
+    """
+    known = set(_names())
+    if len(program) > _MOST_PICKLE_BYTES:
+        raise AssetError(f"{path} describes its tensors in {len(program)} bytes; more than any network needs")
+    for count, (instruction, argument, position) in enumerate(pickletools.genops(program.tobytes())):
+        name = instruction.name
+        if name == "GLOBAL":  # its successor takes the name off the stack; then the unpickler looks at it
+            _check_name(tuple(str(argument).split(" ", 1)), known, path)
+        elif name in ("INST", "OBJ", "EXT1", "EXT2", "EXT4"):
+            raise AssetError(f"{path} holds the instruction {name}, which can run code; nothing was run", _KEEP_OUT)
+        elif name.endswith("PUT") and int(argument) > count:  # type: ignore[arg-type]
+            raise AssetError(f"{path} is damaged: it numbers its objects beyond their count")
+        elif name == "STOP":
+            return (position or 0) + 1
+    raise AssetError(f"{path} is damaged or cut short", "download it again")
+
+
+def _check_name(name: tuple[str, ...], known: set[tuple[str, str]], path: Path) -> None:
+    if name not in known:
+        raise AssetError(
+            f"{path} holds code ({'.'.join(name)}) beside its tensors; nothing of it was run", _KEEP_OUT
+        )
+
+
+class _Namespace:
+    """Stands for ``argparse.Namespace``: options by name."""
+
+    def __init__(self) -> None:
+        self.options: dict[str, Any] = {}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.options = dict(state)
+
+
+class _Dtype:
+    """Stands for ``numpy.dtype`` of a scalar."""
+
+    def __init__(self, code: str, *_: object) -> None:
+        self.code = code
+
+    def __setstate__(self, state: object) -> None:
+        """Byte order and alignment, which scalars do not need."""
+
+
+class _Call(_Sealed):
+    """A function of ours under a name of the checkpoint's."""
+
+    __slots__ = ("_function",)
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+
+    def __call__(self, *arguments: Any) -> Any:
+        """The function's answer."""
+        return self._function(*arguments)
+
+
+def _names() -> dict[tuple[str, str], Any]:
+    """Everything a checkpoint may name, and what stands for it.
+
+    No pickle can change what stands here for the next one: functions are sealed, the one class is new each time.
+    """
+    scalar, tensor, first = _Call(_scalar), _Call(_tensor), _Call(lambda value, *_: value)
+    names = {
+        ("collections", "OrderedDict"): OrderedDict,
+        ("torch._utils", "_rebuild_tensor_v2"): tensor,
+        ("torch._utils", "_rebuild_tensor"): tensor,
+        ("torch._utils", "_rebuild_parameter"): first,
+        ("torch.nn.parameter", "Parameter"): first,
+        ("torch", "Size"): _Call(tuple),
+        ("torch", "device"): _Call(lambda kind, *_: kind),
+        ("argparse", "Namespace"): type("_Namespace", (_Namespace,), {}),
+        ("numpy", "dtype"): _Call(_Dtype),
+        ("numpy.core.multiarray", "scalar"): scalar,
+        ("numpy._core.multiarray", "scalar"): scalar,
+        ("_codecs", "encode"): _Call(lambda text, _: text.encode("latin1")),
+    }
+    return names | {("torch", kind): kind for kind in _STORAGES}
+
+
+def _scalar(dtype: _Dtype, data: bytes) -> float | int | bool:
+    """Value of a numpy scalar."""
+    return np.frombuffer(data, _NUMPY_SCALARS[dtype.code])[0].item()
+
+
+def _tensor(storage: Any, offset: int, size: Any, stride: Any, *_: object) -> StoredTensor:
+    """A tensor, if all of it lies within its storage."""
+    shape, strides = tuple(size), tuple(stride)
+    numbers = (offset, *shape, *strides)
+    if not isinstance(storage, _Storage) or len(shape) != len(strides):
+        raise AssetError("a tensor of the checkpoint has no storage or no shape", "download it again")
+    if not all(type(number) is int and number >= 0 for number in numbers):
+        raise AssetError("a tensor of the checkpoint has sizes that are no counts", "download it again")
+    last = offset + sum((length - 1) * step for length, step in zip(shape, strides, strict=True))
+    if math.prod(shape) > storage.length or (0 not in shape and last >= storage.length):
+        raise AssetError(
+            f"a tensor of the checkpoint claims shape {list(shape)} but its storage has {storage.length} numbers",
+            "download it again",
+        )
+    return StoredTensor(storage, offset, shape, strides)
+
+
+def _run(program: memoryview, stored: Callable[[str, str, int], _Storage], path: Path) -> Any:
+    """The value that the pickle builds, freed of stand-ins."""
+    names = _names()
+
+    class Restricted(pickle.Unpickler):
+        """An unpickler that finds the known names and nothing else."""
+
+        def find_class(self, module: str, name: str) -> Any:
+            _check_name((module, name), set(names), path)
+            return names[module, name]
+
+        def persistent_load(self, pid: Any) -> _Storage:
+            tag, kind, key, _, count = pid[:5]
+            if tag != "storage" or kind not in _STORAGES or type(key) is not str or type(count) is not int:
+                raise AssetError(f"{path} refers to something other than numbers")
+            return stored(kind, key, count)
+
+    return _plain(Restricted(io.BytesIO(program), encoding="latin1").load(), path)
+
+
+def _plain(value: Any, path: Path) -> Any:
+    """``value`` with stand-ins replaced, if it is of bounded size."""
+    seen = 0
+
+    def walk(item: Any, depth: int) -> Any:
+        nonlocal seen
+        seen += 1
+        if seen > _MOST_VALUES or depth > _MOST_DEPTH:
+            raise AssetError(f"{path} holds more values, or more deeply nested ones, than any network needs")
+        if isinstance(item, _Namespace):
+            item = item.options
+        if isinstance(item, dict):
+            return {key: walk(inner, depth + 1) for key, inner in item.items()}
+        if isinstance(item, list | tuple | set | frozenset):
+            return [walk(inner, depth + 1) for inner in item]
+        if item is None or isinstance(item, str | bytes | bool | int | float | StoredTensor):
+            return item
+        raise AssetError(f"{path} holds a {type(item).__name__} where plain values are expected")
+
+    return walk(value, 0)
+
+
+def write_safetensors(
+    target: Path,
+    tensors: Mapping[str, StoredTensor],
+    metadata: Mapping[str, str],
+    *,
+    source: Path,
+    progress: Progress = SILENT,
+) -> None:
+    """Writes tensors one after the other, so that memory holds one of them at a time.
+
+    Args:
+        target: the file; it appears when it is complete.
+        tensors: by name.
+        metadata: strings by name.
+        source: where they come from, for messages.
+        progress: counts bytes.
+
+    Raises:
+        AssetError: the source is damaged, or holds numbers that are not finite.
+    """
+    header: dict[str, Any] = {"__metadata__": dict(metadata)}
+    end = 0
+    for name, tensor in tensors.items():
+        is_float = tensor.storage.dtype.kind == "f"
+        start, end = end, end + math.prod(tensor.shape) * (4 if is_float else 8)
+        header[name] = {
+            "dtype": "F32" if is_float else "I64",
+            "shape": list(tensor.shape),
+            "data_offsets": [start, end],
+        }
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        with temporary.open("wb") as file:
+            file.write(len(text).to_bytes(8, "little") + text)
+            for name, tensor in tensors.items():
+                array = tensor.array()
+                if array.dtype.kind == "f" and not np.isfinite(array).all():
+                    raise AssetError(f"{source}: {name} holds numbers that are not finite", "download it again")
+                file.write(array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes())
+                progress.update(header[name]["data_offsets"][1], end)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)

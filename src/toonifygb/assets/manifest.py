@@ -1,0 +1,89 @@
+"""The list of model files that can be added: ``manifest.toml`` as frozen records."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from toonifygb.errors import InputError
+
+MANIFEST = Path(__file__).with_name("manifest.toml")
+
+
+@dataclass(frozen=True)
+class License:
+    """Terms under which a file may be used."""
+
+    key: str
+    name: str
+    url: str
+    summary: str
+
+
+@dataclass(frozen=True)
+class Asset:
+    """One file of other people that can be added."""
+
+    name: str
+    title: str
+    kind: str
+    """What it is converted by."""
+    file: str
+    """Name under which the authors publish it."""
+    license: License
+    citation: str
+    urls: tuple[str, ...]
+    """Direct downloads, tried in this order."""
+    pages: tuple[str, ...]
+    """Where a person finds it."""
+    nearest_style: str
+    """Built-in style that needs no file and comes closest."""
+    size_bytes: int | None
+    """None where nobody has published it."""
+    sha256: str | None
+    """None where nobody has published it."""
+
+
+@cache
+def manifest() -> dict[str, Asset]:
+    """All assets by name."""
+    return read_manifest(MANIFEST)
+
+
+def read_manifest(path: Path) -> dict[str, Asset]:
+    """The assets that a manifest lists."""
+    table = tomllib.loads(path.read_text(encoding="utf-8"))
+    licenses = {key: License(key=key, **entry) for key, entry in table["licenses"].items()}
+    assets = {}
+    for name, entry in table["assets"].items():
+        work = table["works"][entry["work"]]
+        assets[name] = Asset(
+            name=name,
+            title=entry["title"],
+            kind=entry["kind"],
+            file=entry["file"],
+            license=licenses[entry["license"]],
+            citation=work["citation"],
+            urls=tuple(entry["urls"]),
+            pages=(*entry["pages"], *work["pages"]),
+            nearest_style=entry["nearest_style"],
+            size_bytes=entry.get("bytes"),
+            sha256=entry.get("sha256"),
+        )
+    return assets
+
+
+def find(name: str) -> Asset:
+    """The asset of that name.
+
+    Raises:
+        InputError: there is none; the nearest name is offered.
+    """
+    known = manifest()
+    if name in known:
+        return known[name]
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
+    raise InputError(f"model '{name}' does not exist; available: {', '.join(known)}", f"did you mean '{near}'?")
