@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from toonifygb.assets.archive import StoredArchive
+from toonifygb.atomic import replacing
 from toonifygb.errors import AssetError
 from toonifygb.progress import SILENT
 
@@ -385,18 +386,13 @@ def write_safetensors(
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        with temporary.open("wb") as file:
-            file.write(len(text).to_bytes(8, "little") + text)
-            for name, tensor in tensors.items():
-                array = tensor.array()
-                if array.dtype.kind == "f" and not np.isfinite(array).all():
-                    raise AssetError(f"{source}: {name} holds numbers that are not finite", "download it again")
-                file.write(array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes())
-                progress.update(header[name]["data_offsets"][1], end)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(target) as temporary, temporary.open("wb") as file:
+        file.write(len(text).to_bytes(8, "little") + text)
+        for name, tensor in tensors.items():
+            array = tensor.array()
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
+                raise AssetError(f"{source}: {name} holds numbers that are not finite", "download it again")
+            file.write(array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes())
+            progress.update(header[name]["data_offsets"][1], end)
+        file.flush()
+        os.fsync(file.fileno())

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from toonifygb.assets.download import RESUMABLE, download
 from toonifygb.assets.manifest import Asset, find, manifest
+from toonifygb.atomic import replacing
 from toonifygb.errors import AssetError
 from toonifygb.progress import SILENT
 
@@ -226,6 +227,5 @@ def _digest(path: Path) -> str:
 def _write_json(path: Path, value: object) -> None:
     """Writes JSON so that the file is at no moment half there."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(json.dumps(value, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    temporary.replace(path)
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(value, indent=1, sort_keys=True) + "\n", encoding="utf-8")

@@ -43,11 +43,10 @@ def load_landmarks(path: Path) -> Landmarks:
 
 def save_state(state: dict[str, Any], path: Path) -> None:
     """Writes what a style keeps of a clip, numbers and arrays, exactly."""
-    temporary = path.with_name(f".{path.name}.part")
     arrays = {name: np.ascontiguousarray(value) for name, value in state.items() if isinstance(value, np.ndarray)}
     plain = {name: value for name, value in state.items() if name not in arrays}
-    numpy.save_file(arrays, temporary, metadata={"plain": json.dumps(plain)})
-    os.replace(temporary, path)
+    with replacing(path) as temporary:
+        numpy.save_file(arrays, temporary, metadata={"plain": json.dumps(plain)})
 
 
 def load_state(path: Path) -> dict[str, Any]:

@@ -7,7 +7,6 @@ and version and the variant as JSON. Nothing is ever skipped in silence: a missi
 from __future__ import annotations
 
 import json
-import os
 import re
 from dataclasses import asdict, fields, replace
 from functools import cache
@@ -19,6 +18,7 @@ from safetensors.torch import save_file
 
 from toonifygb.assets import convert
 from toonifygb.assets.convert import Checkpoint, StoredTensor
+from toonifygb.atomic import replacing
 from toonifygb.errors import AssetError
 from toonifygb.progress import SILENT
 from toonifygb.stylize.styleganex.layers import binomial_kernel, fir_kernel
@@ -82,12 +82,8 @@ def save(network: StyleGANEX, path: Path) -> None:
     if len(network.editing_w):
         tensors["editing_w"] = network.editing_w.clone()
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with replacing(path) as temporary:
         save_file(tensors, temporary, _metadata(network.variant, "saved"))
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def convert_checkpoint(source: Path, target: Path, *, progress: Progress = SILENT) -> None:
