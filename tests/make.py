@@ -131,6 +131,7 @@ def tiny_head() -> HeadModel:
         },
         landmark_faces=landmark_faces,
         landmark_bary=torch.full((478, 3), 1 / 3),
+        landmark_offset=torch.zeros(478, 3),
         landmark_sigma=torch.full((478,), 0.002),
         landmark_mirror=torch.arange(478),
         parents=PARENTS,

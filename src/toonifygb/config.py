@@ -86,7 +86,7 @@ class TrackConfig:
 
     on: TrackOn = "auto"
     """Video whose landmarks are fitted: original, stylized, or auto (the one whose landmarks are steadier)."""
-    n_shape: int = 80
+    n_shape: int = 92
     """Identity coefficients fitted."""
     iterations: int = 25
     """Levenberg-Marquardt iterations at most."""

@@ -135,7 +135,7 @@ def test_points_are_the_barycentric_mix(open_head: head.HeadModel) -> None:
 
 def test_landmarks_are_the_embedded_points(open_head: head.HeadModel) -> None:
     corners = open_head.template[open_head.faces[open_head.landmark_faces]]
-    expected = (corners * open_head.landmark_bary[..., None]).sum(-2)
+    expected = (corners * open_head.landmark_bary[..., None]).sum(-2) + open_head.landmark_offset
     assert (open_head.landmarks().template - expected).abs().max() < 1e-12
 
 

@@ -147,7 +147,7 @@ def test_only_the_neck_is_open(model: head.HeadModel) -> None:
 
 
 def test_lids_meet_at_one(model: head.HeadModel) -> None:
-    landmarks = model.landmarks()
+    landmarks = model.at(model.landmark_faces, model.landmark_bary)
     zero, ones = torch.zeros(model.n_shape), torch.ones(2)
     opened = landmarks.rest(zero)
     closed = landmarks.rest(zero, eyelids=ones)

@@ -19,6 +19,8 @@ import numpy as np
 from open_head.surface import Surface
 
 TABLE = Path(__file__).parent / "landmarks.csv"
+OFFSETS = Path(__file__).parent / "landmark_offsets.csv"
+"""How far beside their surface points the landmarks are detected, by ``tools/fit_landmark_offsets.py``."""
 IRIS = ((468, "eye_right"), (473, "eye_left"))
 """Number of each pupil; the next four are the rim of its iris at +x, +y, -x, -y."""
 IRIS_SIGMA_MM = 0.8
@@ -28,6 +30,15 @@ LID_PAIRS = (((386, 374), (385, 380), (387, 373)), ((159, 145), (158, 153), (160
 """Landmarks of the upper and lower lid that meet in a blink, left and right eye."""
 BROWS = ((276, 283, 282, 295, 285, 300, 293, 334, 296, 336), (46, 53, 52, 65, 55, 70, 63, 105, 66, 107))
 """Landmarks of the left and right brow: the lower edge from outside in, then the upper edge."""
+
+
+def load_offsets() -> np.ndarray:
+    """Constant offset of each landmark from its surface point, head axes, m (478, 3); irises have none."""
+    offsets = np.zeros((478, 3))
+    with OFFSETS.open(newline="") as file:
+        for row in csv.DictReader(file):
+            offsets[int(row["landmark"])] = [float(row[f"{axis}_mm"]) / 1000 for axis in "xyz"]
+    return offsets
 
 
 @dataclass(frozen=True)

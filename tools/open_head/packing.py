@@ -7,6 +7,7 @@ import json
 from typing import TYPE_CHECKING
 
 import numpy as np
+from open_head.landmarks import load_offsets
 from safetensors.numpy import save
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ def pack(
         "landmark_bary": embedding.bary.astype(np.float32),
         "landmark_sigma": embedding.sigma.astype(np.float32),
         "landmark_mirror": embedding.mirror.astype(np.int16),
+        "landmark_offset": load_offsets().astype(np.float32),
     }
     bases = (
         ("expression_basis", motion.expression_basis),

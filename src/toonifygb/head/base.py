@@ -82,6 +82,8 @@ class HeadModel(TensorRecord):
     landmark_faces: Int[Tensor, " l"]
     """Face that carries each of MediaPipe's 478 landmarks; l = 0 for loose points."""
     landmark_bary: Float[Tensor, "l 3"]
+    landmark_offset: Float[Tensor, "l 3"]
+    """Where the detector sees each landmark beside its surface point, head axes, m."""
     landmark_sigma: Float[Tensor, " l"]
     """How far the detector wanders on the surface at each landmark, median, m."""
     landmark_mirror: Int[Tensor, " l"]
@@ -194,8 +196,9 @@ class HeadModel(TensorRecord):
         return model if self.uv is None else replace(model, uv=self.uv[kept])
 
     def landmarks(self) -> HeadModel:
-        """Model of the landmark points alone, in MediaPipe's order."""
-        return self.at(self.landmark_faces, self.landmark_bary)
+        """Model of the landmark points alone, in MediaPipe's order, where the detector sees them."""
+        points = self.at(self.landmark_faces, self.landmark_bary)
+        return replace(points, template=points.template + self.landmark_offset)
 
     def _resampled(
         self, pick: Callable[[Tensor], Tensor], part: Int[Tensor, " n"], faces: Int[Tensor, "f 3"]

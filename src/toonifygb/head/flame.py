@@ -75,6 +75,7 @@ def from_arrays(
         regions=regions or {},
         landmark_faces=torch.zeros(0, dtype=torch.int64),
         landmark_bary=template.new_zeros(0, 3),
+        landmark_offset=template.new_zeros(0, 3),
         landmark_sigma=template.new_zeros(0),
         landmark_mirror=torch.zeros(0, dtype=torch.int64),
     )

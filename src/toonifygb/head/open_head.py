@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from torch import Tensor
 
-SHA256 = "44b413b20d1b8bd0cbc945a2e56dee103d5f36a198d6153918a3fd699dd0fb74"
+SHA256 = "b8197bb7c11d9b9d73fcb9e6dc9f2eedb91d76d31d24813f569e2cbeabc9ebe8"
 """Of the shipped file; the builder prints the same."""
 FACE_MODES = 72
 """The first so many identity coefficients explain the face, ears and skull following by regression; the others
@@ -96,6 +96,7 @@ def decode(path: Path) -> HeadModel:
         regions={name: regions[:, column].contiguous() for column, name in enumerate(notes["regions"])},
         landmark_faces=whole("landmark_faces"),
         landmark_bary=real("landmark_bary"),
+        landmark_offset=real("landmark_offset"),
         landmark_sigma=real("landmark_sigma"),
         landmark_mirror=whole("landmark_mirror"),
         uv=real("uv"),

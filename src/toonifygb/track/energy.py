@@ -30,7 +30,7 @@ LID_PAIRS = (
 LIP_PAIRS = ((13, 14), (82, 87), (312, 317), (81, 178), (311, 402), (61, 291), (0, 17))
 """Landmarks whose distance says how far eyes and mouth are open: it is known better than either position."""
 
-DATA_SHARE = 1.0
+DATA_SHARE = 1.2
 """Weight of a landmark at one sigma against one sigma of a prior."""
 KERNEL = 5.0
 """Geman-McClure scale, sigmas: landmarks further off than this hardly count."""

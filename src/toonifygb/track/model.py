@@ -114,7 +114,7 @@ class LandmarkModel(TensorRecord):
     @classmethod
     def from_head(cls, head: HeadModel, n_shape: int) -> LandmarkModel:
         """Landmark model with the first ``n_shape`` identity coefficients of ``head``."""
-        points = head.at(head.landmark_faces, head.landmark_bary)
+        points = head.landmarks()
         n_shape = min(n_shape, points.shape_basis.shape[-1])
         lids = points.eyelid_basis
         if lids is None:  # FLAME without the eyelid add-on: the lids' parameters stay at their prior, open

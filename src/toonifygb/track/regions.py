@@ -65,7 +65,7 @@ def head_boxes(sequence: TrackedSequence, head: HeadModel) -> Boxes:
         head: the model it was tracked with.
     """
     skull = head.subset(_above_chin(head).nonzero()[:, 0])
-    face = head.at(head.landmark_faces, head.landmark_bary)
+    face = head.landmarks()
     return Boxes(_boxes(sequence, skull), _boxes(sequence, face))
 
 
