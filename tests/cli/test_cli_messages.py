@@ -63,7 +63,13 @@ def unknown_style(folder: Path) -> list[str]:
 
 
 def no_face(folder: Path) -> list[str]:
-    return ["create", str(write_clip(folder / "clip.mp4", 6, first_seed=20)), "--out", str(folder / "run"), "--quiet"]
+    return [
+        "create",
+        str(write_clip(folder / "clip.mp4", 6, first_seed=20)),
+        "--out",
+        str(folder / "run"),
+        "--quiet",
+    ]
 
 
 def unknown_setting(folder: Path) -> list[str]:
