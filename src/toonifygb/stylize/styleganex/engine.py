@@ -116,6 +116,8 @@ class Engine:
             w_plus = torch.from_numpy(codes)[None].to(self._device)
             dtype = getattr(torch, self.config.precision)
             self._clip = key, self._compile(self._loaded(), w_plus, dtype=dtype, levels=self.config.levels)
+            if self.config.codes != "each":
+                self._network = None  # 1.3 GB that the frames of a clip do not need
         return self._clip[1]
 
     def _batch_size(self, pixels: int) -> int:
