@@ -1,10 +1,10 @@
 """Measures how far off the surface the landmarks lie; writes ``open_head/landmark_offsets.csv``.
 
 ``fit_landmark_embedding.py`` pins each landmark to the surface. The face network's idea of it may lie beside that
-point by the same millimetre or two in every picture (above all along the outline of the face), and it slides a little
-as the head turns. Here random heads are rendered again and each landmark's miss, in the head's axes, is fitted as
-a constant plus a part that is linear in the direction of the view. Only the constant is kept, made symmetric: the
-sliding differs between bald clay heads and people.
+point by the same millimetre or two in every picture (above all along the outline of the face), and it slides a
+little as the head turns. Here random heads are rendered again and each landmark's miss, in the head's axes, is
+fitted as a constant plus a part that is linear in the direction of the view. Only the constant is kept, made
+symmetric: the sliding differs between bald clay heads and people.
 
     python tools/fit_landmark_offsets.py
 """

@@ -7,8 +7,9 @@ import json
 from typing import TYPE_CHECKING
 
 import numpy as np
-from open_head.landmarks import load_offsets
 from safetensors.numpy import save
+
+from open_head.landmarks import load_offsets
 
 if TYPE_CHECKING:
     from pathlib import Path
