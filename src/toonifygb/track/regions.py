@@ -123,8 +123,11 @@ def _inside(
     rows, columns = max(round(height / scale), 1), max(round(width / scale), 1)
     y = (torch.arange(rows) + 0.5) * (height / rows)
     x = (torch.arange(columns) + 0.5) * (width / columns)
-    across, down = x[:, None] * normals[:, 0], y[:, None] * normals[:, 1]
-    beyond = ((across[None] + down[:, None] - reach) / softness).amax(-1).clamp(0, 1)
+    beyond = torch.zeros(rows, columns)
+    for normal, limit, soft in zip(normals, reach, softness, strict=True):
+        plane = (x * normal[0])[None] + (y * normal[1] - limit)[:, None]
+        torch.maximum(beyond, plane.div_(soft), out=beyond)
+    beyond.clamp_(max=1)
     mask = 1 - beyond.square() * (3 - 2 * beyond)
     shape = (height, width)
     return torch.nn.functional.interpolate(mask[None, None], shape, mode="bilinear", align_corners=False)[0, 0]
