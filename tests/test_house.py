@@ -30,6 +30,7 @@ FLOORS = {
     6: ("pipeline",),
     7: ("batch",),
     8: ("cli",),
+    9: ("__main__",),
 }
 """A room imports floors below its own only; rooms of one floor meet through structures."""
 FLOOR_OF = {room: floor for floor, rooms in FLOORS.items() for room in rooms}
