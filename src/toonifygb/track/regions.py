@@ -14,7 +14,9 @@ import torch
 from torch import Tensor
 
 from toonifygb.geometry import cameras
+from toonifygb.geometry.rotations import axis_angle_to_matrix
 from toonifygb.structures import TensorRecord
+from toonifygb.track.model import ROOT
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -97,14 +99,16 @@ class HeadRegion:
     def __call__(self, index: int) -> Float[Tensor, "h w"]:
         """Soft mask 0..1 of frame ``index``."""
         sequence = self._sequence
-        world, _ = self._outline.forward(sequence.shape, sequence.motion[index])
+        motion = sequence.motion[index]
+        world, _ = self._outline.forward(sequence.shape, motion)
         pixels, _ = cameras.project(sequence.camera, world)
-        neck = pixels[self._cut].mean(0)
-        upwards = pixels.mean(0) - neck
-        height = 2 * upwards.norm()
+        ring = world[self._cut].mean(0)
+        body = axis_angle_to_matrix(motion.joints[ROOT])
+        neck, below = cameras.project(sequence.camera, torch.stack([ring, ring - NECK_LENGTH * body[:, 1]]))[0]
+        height = 2 * (pixels.mean(0) - neck).norm()
         reach = (pixels @ self._normals.T).amax(0)
-        # The last half-plane cuts through the neck, square to it.
-        down = -upwards / upwards.norm()
+        # The last half-plane cuts through the neck, square to the body: a nod bends the neck, not the collar.
+        down = torch.nn.functional.normalize(below - neck, dim=0)
         normals = torch.cat([self._normals, down[None]])
         reach = torch.cat([reach, (neck @ down)[None]])
         softness = height * torch.tensor([EDGE_SOFTNESS] * N_DIRECTIONS + [NECK_SOFTNESS])
