@@ -354,6 +354,6 @@ def train_avatar(run: Run, config: RunConfig, cut: str, tracked: str) -> str:
             threads=config.threads,
             progress=progress,
         )
-        avatars.save(trained, out)
+        avatars.save(trained, out, storage=config.train.storage)
 
     return run.stage("train", "training the avatar", inputs=[cut, tracked, config.train], outputs=[out], work=work)
