@@ -73,7 +73,7 @@ def make_motion(head: HeadModel, n_frames: int, fps: float, seed: int) -> HeadMo
 
     The head turns by its neck joint within ``YAW_DEG`` and ``PITCH_DEG``, the body sways a little with the root,
     the eyes turn against the head. The translation puts the head in front of a ``tracked_camera`` with a focal
-    length of 1.8 image heights.
+    length of 1.42 image heights.
     """
     rng = np.random.Generator(np.random.Philox(seed + 4000))
     time = np.arange(n_frames) / fps
