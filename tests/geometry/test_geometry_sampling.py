@@ -11,6 +11,7 @@ import torch
 from test_geometry_meshes import grid_sphere
 
 from toonifygb.geometry import meshes, sampling
+from toonifygb.geometry.sampling import curve_order
 
 FLAT = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), torch.tensor([[0, 1, 2], [0, 2, 3]])
 
@@ -131,3 +132,14 @@ def test_64k_points_take_seconds():
 def test_a_mesh_without_area_is_refused():
     with pytest.raises(AssertionError, match="without weighted area"):
         meshes.sample_surface(torch.zeros(3, 3), torch.tensor([[0, 1, 2]]), 5)
+
+
+def test_curve_order_keeps_neighbours_together() -> None:
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(2000, 3, generator=generator)
+    order = curve_order(points)
+    assert torch.equal(order.sort().values, torch.arange(2000))
+    hop = (points[order][1:] - points[order][:-1]).norm(dim=-1).mean()
+    assert hop < 0.25 * (points[1:] - points[:-1]).norm(dim=-1).mean()
+    assert torch.equal(curve_order(1000 * points - 5), order)
+    assert torch.equal(curve_order(torch.zeros(3, 3)), torch.arange(3))

@@ -7,6 +7,7 @@ namespace TGB_ISA {
 namespace {
 
 constexpr int kSweep = 4096;    // parameters per blending task: they stay in the L1 cache while rows stream past
+constexpr int kLiveBlock = 64;    // Gaussians that are left out together where a row moves none of them
 constexpr int kAdamChunk = 8192;  // parameters per Adam task: gradient and rates stay in the L2 cache
 
 inline F load_delta(const float* p) { return load_unaligned(p); }
@@ -100,28 +101,34 @@ inline void adam_range(const AdamFactors& f, float weight, const float* g, const
 // Learning rates of row k for Gaussians [g0, g1) of a group; returns whether any is not zero.
 inline bool scaled_rates(const float* rates, const float* scale, int width, int g0, int g1, float* out) {
   bool live = false;
-  for (int g = g0; g < g1; g++) {
-    const float s = scale[g];
-    live |= s != 0;
-    for (int j = 0; j < width; j++) *out++ = s * *rates++;
-  }
-  return live;
+  for (int g = g0; g < g1; g++) live |= scale[g] != 0;
+  if (!live) return false;
+  for (int g = g0; g < g1; g++)
+    for (int j = 0; j < width; j++) *out++ = scale[g] * *rates++;
+  return true;
+}
+
+// Row k of Gaussians [g0, g1), a part of a task, of a group; nothing where the row moves none of them.
+inline void scaled_adam(const BlendState& s, const AdamFactors& f, int64_t offset, int width, int k, int g0, int g1) {
+  float rates[kAdamChunk];
+  const int64_t begin = offset + static_cast<int64_t>(g0) * width, at = k * s.p + begin;
+  if (!scaled_rates(s.learning_rates + begin, s.scale + static_cast<int64_t>(k) * s.n, width, g0, g1, rates)) return;
+  adam_range(f, s.psi[k], s.gradient + begin, rates, s.deltas + at, s.first_moment + at, s.second_moment + at,
+             (g1 - g0) * width);
 }
 
 // Task `task` of group `width` wide, starting at parameter `offset`: some Gaussians, all rows.
 void blend_adam_task(const BlendState& s, const AdamFactors& f, int64_t offset, int width, int task, int per_task) {
   const int g0 = task * per_task, g1 = imin(s.n, g0 + per_task), count = (g1 - g0) * width;
   const int64_t begin = offset + static_cast<int64_t>(g0) * width;
-  float scaled[kAdamChunk];
   for (int k = 0; k < s.k; k++) {
     if (s.skip_inactive && s.psi[k] == 0) continue;
-    const float* rates = s.learning_rates + begin;
-    if (s.scale != nullptr) {
-      if (!scaled_rates(rates, s.scale + static_cast<int64_t>(k) * s.n, width, g0, g1, scaled)) continue;
-      rates = scaled;
-    }
-    const int64_t at = k * s.p + begin;
-    adam_range(f, s.psi[k], s.gradient + begin, rates, s.deltas + at, s.first_moment + at, s.second_moment + at, count);
+    if (s.scale == nullptr)
+      adam_range(f, s.psi[k], s.gradient + begin, s.learning_rates + begin, s.deltas + k * s.p + begin,
+                 s.first_moment + k * s.p + begin, s.second_moment + k * s.p + begin, count);
+    else
+      for (int g = g0; g < g1; g += kLiveBlock)
+        scaled_adam(s, f, offset, width, k, g, imin(g1, g + kLiveBlock));
   }
 }
 

@@ -17,6 +17,7 @@ from toonifygb.avatar.mouth import mouth_points
 from toonifygb.avatar.transfer import consistency, turns
 from toonifygb.geometry.cameras import tracked_camera
 from toonifygb.geometry.meshes import barycentric, face_areas, sample_surface, vertex_normals
+from toonifygb.geometry.sampling import curve_order
 from toonifygb.head import JOINTS, PARTS
 from toonifygb.structures import GaussianParams, HeadMotion
 
@@ -173,7 +174,9 @@ def _face_set(
     basis += [] if head.eyelid_basis is None else [head.eyelid_basis]
     movement = torch.cat(basis, dim=-1).movedim(-1, 0)
 
-    # Those that some blendshape moves come first.
+    # Those that some blendshape moves come first, and neighbours come together: the same blendshapes move them, so
+    # that training can leave out whole stretches of the others.
+    places = places.pick(curve_order(places.points(rest, surface.faces)[0]))
     moved = (consistency(barycentric(movement, surface.faces, places.face_ids, places.bary)) > 0).any(0)
     places = places.pick(torch.argsort(moved.int(), descending=True, stable=True))
     at = surface.at(places.face_ids, places.bary)

@@ -25,6 +25,7 @@ _FIRST_RADIUS = 0.9
 """In units of √(area / n). A maximal random packing of radius r holds about 0.7·area/r² points, so this first
 radius keeps too few, which is what the shrinking needs."""
 _SHRINK = 0.95
+_CURVE_BITS = 10
 _PAIRS_AT_ONCE = 4_000_000
 """Candidate pairs measured in one go; bounds the memory to some 300 MB."""
 
@@ -204,3 +205,18 @@ def _expand(
         members = np.arange(len(rows)) - np.repeat(ends[first:last] - counts[first:last] - done, counts[first:last])
         yield rows, start[rows] + members
         first = last
+
+
+def curve_order(points: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:
+    """Indices that put points along a space-filling curve (Morton's): what lies together comes together.
+
+    Args:
+        points: any unit; their bounding cube is divided into 1024³ cells.
+    """
+    extent = (points.amax(0) - points.amin(0)).amax().clamp_min(torch.finfo(points.dtype).tiny)
+    cells = ((points - points.amin(0)) / extent * (2**_CURVE_BITS - 1)).long()
+    code = torch.zeros(len(points), dtype=torch.int64)
+    for bit in range(_CURVE_BITS):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return code.argsort(stable=True)

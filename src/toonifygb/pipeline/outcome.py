@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import math
 import platform
 from collections.abc import Iterator
 from contextlib import closing
@@ -17,6 +16,7 @@ import torch
 from toonifygb import __version__, head, metrics, stylize, track, train, video
 from toonifygb import avatar as avatars
 from toonifygb.atomic import replacing
+from toonifygb.avatar.model import pose_quantities
 from toonifygb.pipeline import pictures
 from toonifygb.pipeline.files import LANDMARK_TRACK, open_crops
 from toonifygb.pipeline.report import Curve, Picture, Report, render_report
@@ -24,6 +24,8 @@ from toonifygb.pipeline.stages import peak_memory_mb, write_json
 from toonifygb.pipeline.viewing import AvatarViewer, posed
 
 if TYPE_CHECKING:
+    from jaxtyping import Float
+
     from toonifygb.config import RunConfig
     from toonifygb.pipeline.source import Source
     from toonifygb.pipeline.stages import Run
@@ -32,8 +34,9 @@ if TYPE_CHECKING:
 
 _PANEL = 384
 """Side of each of the preview's four panels, px."""
-_SWING_DEG, _SWING_SECONDS = 35.0, 6.0
-"""The moving side view: how far it turns to each side, and how long one swing there and back takes."""
+_SWING_DEG, _SWING_LEAST_DEG, _SWING_BEYOND_DEG, _SWING_SECONDS = 35.0, 15.0, 10.0, 6.0
+"""The moving side view: how far it turns to each side, the least it may, how far beyond the head's own turns, and
+how long one swing there and back takes at most."""
 _LABELS = ("input", "stylised", "avatar", "avatar, moving view")
 _VIEWS_DEG = (-50.0, -25.0, 0.0, 25.0, 50.0)
 _EXPRESSIONS: tuple[tuple[str, dict[str, float]], ...] = (
@@ -103,16 +106,34 @@ def preview_panels(
     """The four panels of every frame, uint8 RGB squares of one size."""
     dataset = train.load_dataset(run.work("dataset"))
     viewer = AvatarViewer(avatars.load(run.file("avatar")), _PANEL, backend=config.backend, threads=config.threads)
-    period = _SWING_SECONDS * source.info.fps
+    swing = swing_deg(sequence, source.info.fps)
     films = zip(source.frames(config), video.read(run.file("stylized.mp4")), strict=False)
     for index, film in enumerate(itertools.islice(films, dataset.n_frames)):
         motion = sequence.motion[index]
         viewer.look_through(dataset.camera(index))
-        swing = _SWING_DEG * math.sin(2 * math.pi * index / period)
         yield [
             *(train.crop(frame, dataset.boxes[index], _PANEL) for frame in film),
-            *viewer.frames(motion, [(0.0, 0.0), (swing, 0.0)]),
+            *viewer.frames(motion, [(0.0, 0.0), (float(swing[index]), 0.0)]),
         ]
+
+
+def swing_deg(sequence: TrackedSequence, fps: float) -> Float[np.ndarray, " t"]:
+    """Yaw of the moving view in every frame: a swing to both sides that never goes far beyond what was filmed.
+
+    No clip shows what an avatar looks like from where nothing was filmed, so the view keeps within a few degrees of
+    the sides that the head showed of itself.
+
+    Args:
+        sequence: the track.
+        fps: frames per second.
+    """
+    yaw = pose_quantities(sequence.motion)[:, 2].rad2deg().numpy()
+    seen = yaw[sequence.tracked.numpy()]
+    side = np.quantile(np.abs(seen - np.median(seen)), 0.95)
+    limit = max(side + _SWING_BEYOND_DEG, _SWING_LEAST_DEG)
+    swing = _SWING_DEG * np.sin(2 * np.pi * np.arange(len(yaw)) / min(_SWING_SECONDS * fps, len(yaw)))
+    turned = yaw - np.median(seen)
+    return swing.clip(turned - limit, turned + limit)
 
 
 def write_report(source: Source, run: Run, config: RunConfig, scored: str, shown: str) -> None:

@@ -47,7 +47,7 @@ PASSES = (200, 300, 400, 500, 600)
 """Steps after which all frames are fitted; later passes move the heads by less than a tenth of a degree."""
 GAIN = 1.2
 """Share of a Gauss-Newton step that is taken: the curvature is a mean over frames."""
-CURVATURE_FRAMES = 8
+CURVATURE_FRAMES = 5
 """Frames whose curvature is measured: that of an image in its pose hardly depends on which frame it is."""
 RIGID_PRIOR = (0.05, 0.05, 0.05, 0.005, 0.005, 0.02)
 """How far the landmark track may be off: rotation vector, rad, and translation, m; standard deviations."""
