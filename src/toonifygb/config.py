@@ -139,6 +139,8 @@ class TrainConfig:
 class RunConfig:
     """A whole run from clip to avatar."""
 
+    head: str = "open"
+    """Head model: open, or one that you added, flame or flame2023 (toonifygb assets add flame)."""
     quality: Quality = "standard"
     """draft: minutes; standard: a coffee; paper: the published regime."""
     stylize: StylizeConfig = field(default_factory=StylizeConfig)
