@@ -1,0 +1,17 @@
+"""Tracked heads as other projects keep them on disk: read into our track and pictures, and written for them."""
+
+from toonifygb.datasets.export import Exported, export_dataset
+from toonifygb.datasets.folders import LAYOUTS, ForeignFolder, ForeignTrack, Picture, read_picture
+from toonifygb.datasets.reading import read_track, recognize
+
+__all__ = [
+    "LAYOUTS",
+    "Exported",
+    "ForeignFolder",
+    "ForeignTrack",
+    "Picture",
+    "export_dataset",
+    "read_picture",
+    "read_track",
+    "recognize",
+]
