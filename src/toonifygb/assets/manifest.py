@@ -53,7 +53,9 @@ class Asset:
     @property
     def instead(self) -> str:
         """What needs no file, for messages."""
-        return f"the style '{self.nearest_style}'" if self.nearest_style else f"the head model '{self.nearest_head}'"
+        return (
+            f"the style '{self.nearest_style}'" if self.nearest_style else f"the head model '{self.nearest_head}'"
+        )
 
     @property
     def by_hand(self) -> str:

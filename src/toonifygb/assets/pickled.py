@@ -36,7 +36,11 @@ class Dtype:
         Raises:
             AssetError: it is none of numbers.
         """
-        if type(self.code) is not str or not _NUMBERS.fullmatch(self.code) or self.order not in ("<", ">", "|", "="):
+        if (
+            type(self.code) is not str
+            or not _NUMBERS.fullmatch(self.code)
+            or self.order not in ("<", ">", "|", "=")
+        ):
             raise AssetError(f"the file holds an array of the type {self.code!r}; only arrays of numbers are read")
         return np.dtype(self.code).newbyteorder("<" if self.order in "|=" else self.order)
 

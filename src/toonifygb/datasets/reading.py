@@ -121,9 +121,7 @@ def _read_frames(
     turns = torch.cat([_stack(frames, "flame.jaw"), _stack(frames, "flame.eyes")], -1).unflatten(-1, (3, 6))
     joints[:, 2:] = matrix_to_axis_angle(rotation_6d_to_matrix(turns))
     eyelids = [frame.get("flame.eyelids", np.zeros(2)) for frame in frames]
-    still = HeadMotion(
-        expression, joints, torch.zeros(len(frames), 3), torch.from_numpy(np.stack(eyelids)).float()
-    )
+    still = HeadMotion(expression, joints, torch.zeros(len(frames), 3), torch.from_numpy(np.stack(eyelids)).float())
     height, width = (int(size) for size in frames[0]["img_size"])
     rotation, translation, K = _cameras(frames, width, height)
     problems = _odd_sizes(folder, width, height)

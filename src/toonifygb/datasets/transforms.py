@@ -63,7 +63,9 @@ def camera_to_world(frame: dict[str, Any], path: Path) -> Float[np.ndarray, "4 4
         if not rigid or np.linalg.det(turn) < 0:
             raise ValueError("not rigid")
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise InputError(f"{path} holds a frame without a camera pose ({error})", "make the dataset again") from error
+        raise InputError(
+            f"{path} holds a frame without a camera pose ({error})", "make the dataset again"
+        ) from error
     return matrix
 
 

@@ -81,9 +81,7 @@ def _picture(path: Path, row: dict[str, Any]) -> Picture:
     return Picture(image, masks=(mask,)) if "fg_mask_path" in row and mask.is_file() else Picture(image)
 
 
-def read_vhap(
-    folder: ForeignFolder, head: HeadModel
-) -> tuple[Float[Tensor, " s"], HeadMotion, Camera, list[str]]:
+def read_vhap(folder: ForeignFolder, head: HeadModel) -> tuple[Float[Tensor, " s"], HeadMotion, Camera, list[str]]:
     """Shape, motion, camera and problems of the dataset."""
     files = [folder.path / name for name in transforms.SPLITS if (folder.path / name).is_file()]
     rows = _rows(files or [folder.path / "transforms.json"])
@@ -97,7 +95,9 @@ def read_vhap(
         )
     given = {name: torch.from_numpy(array).double() for name, array in arrays.items()}
     joints = torch.cat([given[name] for name in ("rotation", "neck_pose", "jaw_pose", "eyes_pose")], -1)
-    motion = HeadMotion(given["expr"], joints.unflatten(-1, (5, 3)), given["translation"], torch.zeros(len(joints), 2).double())
+    motion = HeadMotion(
+        given["expr"], joints.unflatten(-1, (5, 3)), given["translation"], torch.zeros(len(joints), 2).double()
+    )
     poses, intrinsics = [], []
     for number in folder.ids:
         row = rows[number]
@@ -154,7 +154,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
             raise InputError(f"{path} unpacks to {size / 1e9:.1f} GB; the parameters of a clip need far less")
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError, MemoryError) as error:
         said = " ".join(str(error).split())[:120]
         raise InputError(f"{path} is damaged or holds more than arrays of numbers ({said})") from error
     odd = [name for name, array in arrays.items() if array.dtype.kind not in "fiub"]

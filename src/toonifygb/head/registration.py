@@ -179,16 +179,16 @@ def _marks(head: HeadModel) -> tuple[Int[Tensor, " m"], Int[Tensor, " k"]]:
 
 def _boundary(surface: Surface) -> Float[Tensor, " v"]:
     """1 at vertices on the edge of an open surface."""
-    edges = torch.cat([surface.faces[:, [0, 1]], surface.faces[:, [1, 2]], surface.faces[:, [2, 0]]]).sort(-1).values
+    edges = (
+        torch.cat([surface.faces[:, [0, 1]], surface.faces[:, [1, 2]], surface.faces[:, [2, 0]]]).sort(-1).values
+    )
     found, counts = edges.unique(dim=0, return_counts=True)
     mask = torch.zeros(len(surface.vertices))
     mask[found[counts == 1].flatten()] = 1
     return mask
 
 
-def _fit_identity(
-    moving: HeadModel, other: HeadModel, match: _Matcher
-) -> tuple[Float[Tensor, " s"], _Frame]:
+def _fit_identity(moving: HeadModel, other: HeadModel, match: _Matcher) -> tuple[Float[Tensor, " s"], _Frame]:
     """Identity coefficients and similarity under which the head lies on the surface."""
     n_shape = moving.n_shape
     shape = torch.zeros(n_shape, dtype=torch.float64)
@@ -209,9 +209,7 @@ def _fit_identity(
         weights, planes, distance, offset = match(vertices, gate)
         scaled = frame.scale * frame.rotation
         levers = _levers(vertices[match.ids] - frame.shift, torch.einsum("ab,nbs->nas", scaled, basis))
-        marks = torch.cat(
-            [frame.apply(moving.joints(shape)[own]), *(vertices[near].mean(0)[None] for near in ids)]
-        )
+        marks = torch.cat([frame.apply(moving.joints(shape)[own]), *(vertices[near].mean(0)[None] for near in ids)])
         mark_levers = _levers(marks - frame.shift, torch.einsum("ab,nbs->nas", scaled, mark_basis))
         system = torch.zeros(7 + n_shape, 7 + n_shape, dtype=torch.float64)
         right = torch.zeros(7 + n_shape, dtype=torch.float64)
