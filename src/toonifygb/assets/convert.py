@@ -298,24 +298,6 @@ class _Call(_Sealed):
         return self._function(*arguments)
 
 
-_FUNCTIONS: dict[tuple[str, str], Callable[..., Any]] = {
-    ("collections", "OrderedDict"): OrderedDict,
-    ("torch._utils", "_rebuild_tensor_v2"): lambda *parts: _tensor(*parts),
-    ("torch._utils", "_rebuild_tensor"): lambda *parts: _tensor(*parts),
-    ("torch._utils", "_rebuild_parameter"): lambda value, *_: value,
-    ("torch.nn.parameter", "Parameter"): lambda value, *_: value,
-    ("torch", "Size"): tuple,
-    ("torch", "device"): lambda kind, *_: kind,
-    ("numpy", "dtype"): pickled.Dtype,
-    ("_codecs", "encode"): lambda text, _: text.encode("latin1"),
-    ("copy_reg", "_reconstructor"): pickled.rebuilt,
-    ("copyreg", "_reconstructor"): pickled.rebuilt,
-    # Sets are caches of chumpy's; nothing of theirs is wanted.
-    ("__builtin__", "set"): lambda *_: None,
-    ("builtins", "set"): lambda *_: None,
-}
-
-
 def _names(room: _Room | None = None) -> dict[tuple[str, str], Any]:
     """Everything a checkpoint may name, and what stands for it.
 
@@ -324,7 +306,7 @@ def _names(room: _Room | None = None) -> dict[tuple[str, str], Any]:
     room = room or _Room(0)
     names: dict[tuple[str, str], Any] = {name: _Call(function, room) for name, function in _FUNCTIONS.items()}
     for place in ("numpy.core.multiarray", "numpy._core.multiarray"):
-        names[place, "scalar"] = _Call(lambda dtype, data: _scalar(dtype, data), room)
+        names[place, "scalar"] = _Call(_scalar, room)
         names[place, "_reconstruct"] = _Call(lambda *_: pickled.Array(), room)
     names["argparse", "Namespace"] = type("_Namespace", (_Namespace,), {})
     names |= {("numpy", "ndarray"): "array", ("__builtin__", "object"): "object", ("builtins", "object"): "object"}
@@ -351,6 +333,25 @@ def _tensor(storage: Any, offset: int, size: Any, stride: Any, *_: object) -> St
             "download it again",
         )
     return StoredTensor(storage, offset, shape, strides)
+
+
+_FUNCTIONS: dict[tuple[str, str], Callable[..., Any]] = {
+    ("collections", "OrderedDict"): OrderedDict,
+    ("torch._utils", "_rebuild_tensor_v2"): _tensor,
+    ("torch._utils", "_rebuild_tensor"): _tensor,
+    ("torch._utils", "_rebuild_parameter"): lambda value, *_: value,
+    ("torch.nn.parameter", "Parameter"): lambda value, *_: value,
+    ("torch", "Size"): tuple,
+    ("torch", "device"): lambda kind, *_: kind,
+    ("numpy", "dtype"): pickled.Dtype,
+    ("_codecs", "encode"): lambda text, _: text.encode("latin1"),
+    ("copy_reg", "_reconstructor"): pickled.rebuilt,
+    ("copyreg", "_reconstructor"): pickled.rebuilt,
+    # Sets are caches of chumpy's; nothing of theirs is wanted.
+    ("__builtin__", "set"): lambda *_: None,
+    ("builtins", "set"): lambda *_: None,
+}
+"""What stands for the functions that a checkpoint may call."""
 
 
 def _run(program: memoryview, stored: Callable[[str, str, int], _Storage], path: Path) -> Any:

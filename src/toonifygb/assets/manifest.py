@@ -60,7 +60,8 @@ class Asset:
     @property
     def by_hand(self) -> str:
         """How a person who registered adds it, for messages."""
-        return f"register at {self.sign_up}, download {self.file} and run: toonifygb assets add {self.name} {self.file}"
+        add = f"toonifygb assets add {self.name} {self.file}"
+        return f"register at {self.sign_up}, download {self.file} and run: {add}"
 
 
 @cache

@@ -1,7 +1,7 @@
-"""What stands for the objects of numpy, scipy and chumpy in a foreign pickle: notes of their parts that run nothing.
+"""What stands for objects of numpy, scipy and chumpy in a foreign pickle: notes of their parts that run nothing.
 
-Models of the SMPL family (FLAME among them) are dictionaries of numpy arrays, some of them wrapped by chumpy and one
-a sparse matrix of scipy, pickled by Python 2. Trackers keep numpy arrays in files of ``torch.save``.
+Models of the SMPL family (FLAME among them) are dictionaries of numpy arrays, some of them wrapped by chumpy and
+one a sparse matrix of scipy, pickled by Python 2. Trackers keep numpy arrays in files of ``torch.save``.
 """
 
 from __future__ import annotations

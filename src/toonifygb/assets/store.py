@@ -74,10 +74,10 @@ def model_path(name: str) -> Path:
     asset = find(name)
     path = _model(asset)
     if not (path.is_file() and _note(asset).is_file()):
+        way = asset.by_hand if asset.sign_up else f"toonifygb assets get {name}"
         raise AssetError(
             f"the model '{name}' is not in {path.parent}",
-            f"{asset.by_hand if asset.sign_up else f'toonifygb assets get {name}'}, or use {asset.instead}, which needs "
-            f"no {'file' if asset.sign_up else 'model'}",
+            f"{way}, or use {asset.instead}, which needs none",
         )
     return path
 
@@ -87,8 +87,8 @@ def get(name: str, importer: Importer, consent: Consent, *, progress: Progress =
 
     Raises:
         InputError: no such asset.
-        AssetError: the licence was declined, the file cannot be had (for instance because its authors want to know their
-            users), or it is not what it should be.
+        AssetError: the licence was declined, the file cannot be had (some authors want to know their users), or it
+            is not what it should be.
         Stopped: the user asked to stop; the next call goes on.
     """
     asset = find(name)

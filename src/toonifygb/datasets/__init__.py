@@ -2,9 +2,10 @@
 
 from toonifygb.datasets.export import Crops, Exported, export_dataset
 from toonifygb.datasets.folders import LAYOUTS, ForeignFolder, ForeignTrack, Picture, read_picture
-from toonifygb.datasets.reading import read_track, recognize
+from toonifygb.datasets.reading import FPS, read_track, recognize
 
 __all__ = [
+    "FPS",
     "LAYOUTS",
     "Crops",
     "Exported",

@@ -5,8 +5,8 @@
     canonical.obj           the subject with the jaw a little open
     transforms*.json, flame/exp/%05d.txt, meshes/%05d.obj    what INSTA reads besides
 
-Both projects let the head stand and the camera move, with one focal length and one principal point. Crops that follow
-the head are therefore put back to where they were in the frame, on one canvas that holds them all.
+Both projects let the head stand and the camera move, with one focal length and one principal point. Crops that
+follow the head are therefore put back to where they were in the frame, on one canvas that holds them all.
 """
 
 from __future__ import annotations
@@ -98,8 +98,8 @@ def export_dataset(
     """
     if head.n_shape != N_SHAPE or head.n_expression != N_EXPRESSION:
         raise InputError(
-            f"the track uses the head model {head.name} with {head.n_shape} shape and {head.n_expression} expression "
-            f"coefficients; this layout holds FLAME's {N_SHAPE} and {N_EXPRESSION}",
+            f"the track uses the head model {head.name} with {head.n_shape} shape and {head.n_expression} "
+            f"expression coefficients; this layout holds FLAME's {N_SHAPE} and {N_EXPRESSION}",
             "track with FLAME: toonifygb create CLIP --head flame",
         )
     if out.exists() and (not out.is_dir() or any(out.iterdir())):

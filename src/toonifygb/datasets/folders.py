@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -60,6 +60,19 @@ class ForeignFolder:
     """Frames at the end that are held out."""
     head: str
     """Head model of the track, as ``head.load`` names it."""
+
+    def first(self, n_frames: int | None) -> ForeignFolder:
+        """The dataset's first frames; all of them for ``None``."""
+        if n_frames is None or n_frames >= len(self.ids):
+            return self
+        each = len(self.parameters) == len(self.ids)
+        return replace(
+            self,
+            ids=self.ids[:n_frames],
+            pictures=self.pictures[:n_frames],
+            parameters=self.parameters[:n_frames] if each else self.parameters,
+            n_test=held_out(self.n_test, n_frames),
+        )
 
 
 @dataclass(frozen=True)

@@ -124,7 +124,8 @@ def _read_frames(
     still = HeadMotion(expression, joints, torch.zeros(len(frames), 3), torch.from_numpy(np.stack(eyelids)).float())
     height, width = (int(size) for size in frames[0]["img_size"])
     rotation, translation, K = _cameras(frames, width, height)
-    problems = _odd_sizes(folder, width, height)
+    problems = []
+    _check_size(folder, width, height)
     camera = Camera(K[0].float(), torch.eye(4), width, height)
     motion = before_camera(
         head.to(torch.float64), shape.double(), still.to(torch.float64), rotation, translation
@@ -155,15 +156,15 @@ def _cameras(
     return rotation, translation, pytorch3d_intrinsics(focal[:, 0], principal, width, height)
 
 
-def _odd_sizes(folder: ForeignFolder, width: int, height: int) -> list[str]:
+def _check_size(folder: ForeignFolder, width: int, height: int) -> None:
     """Refuses pictures of another size than they were tracked in."""
     image = video.load_rgba(folder.pictures[0].image)
     if image.shape[:2] != (height, width):
         raise InputError(
-            f"{folder.pictures[0].image} is {image.shape[1]}x{image.shape[0]} px but was tracked at {width}x{height} px",
+            f"{folder.pictures[0].image} is {image.shape[1]}x{image.shape[0]} px but was tracked at "
+            f"{width}x{height} px",
             "give the pictures that the tracker saw",
         )
-    return []
 
 
 def _disagreement(
@@ -187,6 +188,6 @@ def _disagreement(
     if worst < 2e-3:
         return []
     return [
-        f"transforms.json and checkpoint of {folder.path.name} place the camera up to {worst:.3f} m or rad apart; the "
-        "checkpoint is used"
+        f"transforms.json and checkpoint of {folder.path.name} place the camera up to {worst:.3f} m or rad apart; "
+        "the checkpoint is used"
     ]

@@ -89,8 +89,8 @@ def read_vhap(folder: ForeignFolder, head: HeadModel) -> tuple[Float[Tensor, " s
     shape = torch.from_numpy(constant["shape"]).float()
     if shape.shape[0] != head.n_shape or arrays["expr"].shape[1] != head.n_expression:
         raise InputError(
-            f"{folder.path} holds {shape.shape[0]} shape and {arrays['expr'].shape[1]} expression coefficients; the "
-            f"head model {head.name} has {head.n_shape} and {head.n_expression}",
+            f"{folder.path} holds {shape.shape[0]} shape and {arrays['expr'].shape[1]} expression coefficients; "
+            f"the head model {head.name} has {head.n_shape} and {head.n_expression}",
             "use the head model that it was tracked with",
         )
     given = {name: torch.from_numpy(array).double() for name, array in arrays.items()}
@@ -112,7 +112,8 @@ def read_vhap(folder: ForeignFolder, head: HeadModel) -> tuple[Float[Tensor, " s
     offset = float(np.abs(constant.get("static_offset", np.zeros(1))).max())
     if offset > _SMALL_OFFSET:
         problems.append(
-            f"{folder.path.name} moves single vertices by up to {1e3 * offset:.1f} mm (static_offset); this is left out"
+            f"{folder.path.name} moves single vertices by up to {1e3 * offset:.1f} mm (static_offset); "
+            "this is left out"
         )
     if float((K - K[0]).abs().amax()) > 0.5:
         problems.append(f"the cameras of {folder.path.name} differ in focal length; that of the first is used")

@@ -1,7 +1,7 @@
 """From the cameras and poses of other projects to ours.
 
-Ours: the camera stands still with OpenGL axes and the head moves before it. Others let the head stand and the camera
-move, or both; all say the same about where a point of the head is seen from the camera.
+Ours: the camera stands still with OpenGL axes and the head moves before it. Others let the head stand and the
+camera move, or both; all say the same about where a point of the head is seen from the camera.
 """
 
 from __future__ import annotations
@@ -83,9 +83,9 @@ def pytorch3d_intrinsics(
 def head_to_camera(
     head: HeadModel, shape: Float[Tensor, " s"], motion: HeadMotion, world_to_camera: Float[Tensor, "4 4"]
 ) -> tuple[Float[Tensor, "t 3 3"], Float[Tensor, "t 3"]]:
-    """x ↦ R x + t from a head that stands still to OpenCV's camera, as trackers with a moving camera have it.
+    """Map x ↦ R x + t from a head that stands still to OpenCV's camera, as trackers with a moving camera have it.
 
-    The turn of the neck goes into it: the skull, the face, jaw and eyes end up where they were; the neck's own skin,
+    The turn of the neck goes into it: skull, face, jaw and eyes end up where they were; the neck's own skin,
     which such trackers hold stiff, does not follow.
     """
     _, transforms = head.forward(shape, motion)

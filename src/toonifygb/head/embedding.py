@@ -1,7 +1,7 @@
 """What a bare rig lacks, taken from the open head: landmarks, regions, lids.
 
-The open head is registered onto the rig's skin; then each of its landmarks has a nearest point there, and each of the
-rig's vertices one on the open head. No file of anybody's landmarks is needed.
+The open head is registered onto the rig's skin; then each of its landmarks has a nearest point there, and each of
+the rig's vertices one on the open head. No file of anybody's landmarks is needed.
 """
 
 from __future__ import annotations
@@ -112,8 +112,8 @@ def _on_ball(
 ) -> tuple[Int[Tensor, " n"], Float[Tensor, "n 3"]]:
     """Points of an eyeball as far to the side as the given ones, whatever the size of either ball.
 
-    An iris is as wide in every head; what varies is the ball it sits on, so sideways distances are kept and depth is
-    the ball's own.
+    An iris is as wide in every head; what varies is the ball it sits on, so sideways distances are kept and depth
+    is the ball's own.
     """
     numbers = _numbers(rig, part)
     corners = rig.template[rig.faces[numbers]]
