@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from toonifygb.cli.assets import assets
 from toonifygb.cli.progress import Terminal
-from toonifygb.config import PRESETS, FaceConfig, Quality, RunConfig, StylizeConfig, TrackConfig, TrackOn, override
+from toonifygb.config import (
+    PRESETS,
+    WHOLE_PICTURE,
+    FaceConfig,
+    Quality,
+    RunConfig,
+    StylizeConfig,
+    TrackConfig,
+    TrackOn,
+    override,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -170,13 +181,13 @@ def train(
         settings: Any setting by name, for instance train.steps=20000.
         quiet: Say nothing but errors.
     """
-    import dataclasses
-
     from toonifygb.pipeline.create import read_request
 
     clip, run_config = read_request(run)
     if quality:
-        run_config = dataclasses.replace(run_config, quality=quality, train=PRESETS[quality])
+        # What the crops show belongs to the clip rather than to the quality.
+        preset = dataclasses.replace(PRESETS[quality], crop_scale=run_config.train.crop_scale)
+        run_config = dataclasses.replace(run_config, quality=quality, train=preset)
     if head:
         run_config = dataclasses.replace(run_config, head=head)
     _create(clip, run, _with(run_config, settings), quiet)
@@ -265,9 +276,9 @@ def import_(
         head=head,
         quality=quality,
         stylize=StylizeConfig(style=style),
-        # Poses of these trackers were fitted to the pixels already.
+        # Poses of these trackers were fitted to the pixels already, and pictures are crops of the head already.
         track=TrackConfig(photometric=False),
-        train=PRESETS[quality],
+        train=dataclasses.replace(PRESETS[quality], crop_scale=WHOLE_PICTURE),
         max_frames=max_frames,
     )
     run_config = _with(run_config, settings)

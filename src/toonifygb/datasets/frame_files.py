@@ -65,7 +65,7 @@ def read_frame(path: Path) -> dict[str, np.ndarray]:
 
 def _numbers(value: Any) -> np.ndarray | None:
     if isinstance(value, StoredTensor):
-        return value.array().ravel()
+        return value.array().flatten()
     plain = isinstance(value, list) and all(isinstance(item, int | float) for item in value)
     return np.asarray(value, np.float64) if plain else None
 
