@@ -209,7 +209,9 @@ def vhap_folder(folder: Path, each: bool = False, offset: float = 0.0) -> Truth:
     camera[:3, 3] = [-0.05, 0.02, 0.7]
     pixels, frames = [], []
     for index in range(N_FRAMES):
-        seen = (np.append(vertices[index].numpy(), np.ones((head.n_vertices, 1)), 1) @ np.linalg.inv(camera).T)[:, :3]
+        seen = (np.append(vertices[index].numpy(), np.ones((head.n_vertices, 1)), 1) @ np.linalg.inv(camera).T)[
+            :, :3
+        ]
         across = CENTRE[0] + FOCAL * seen[:, 0] / -seen[:, 2]
         down = CENTRE[1] - FOCAL * seen[:, 1] / -seen[:, 2]
         pixels.append(np.stack([across, down], -1))

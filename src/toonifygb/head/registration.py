@@ -1,9 +1,9 @@
 """One head's surface brought onto another's, whatever the other's topology.
 
-Three steps, each of which starts where the last one ended: a similarity from the eyeballs' centres; the similarity
-and the identity coefficients of the moving head together; smooth displacements on top, drawn from Gaussian processes
-of two sizes (as in Gaussian process morphable models). The last two match nearest points again and again. Points
-slide freely along the other surface: only their distance from its tangent planes is held tightly.
+Three steps, each of which starts where the last one ended: a similarity from the eyeballs' centres; the
+similarity and the identity coefficients of the moving head together; smooth displacements on top, drawn from
+Gaussian processes of two sizes (as in Gaussian process morphable models). The last two match nearest points again
+and again. Points slide freely along the other surface: only their distance from its tangent planes is held tightly.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ REACH = 0.008
 TANGENT_SIGMA, SLIDING_SIGMA = 0.3e-3, 5e-3
 """Trust in a match across and along the other surface, m."""
 EYE_SIGMA, MARK_SIGMA, LIPS_SIGMA = 1e-3, 2e-3, 2e-2
-"""Trust in the centres of the eyeballs, in nose and mouth, and in the mouth's place along the lips, m. Without these
-a face that is longer or shorter than expected settles with its nose on the other's lip."""
+"""Trust in the centres of the eyeballs, in nose and mouth, and in the mouth's place along the lips, m. Without
+these a face that is longer or shorter than expected settles with its nose on the other's lip."""
 MARKS_SHARE = 10
 """One of these marks weighs as much as so many matches in a hundred."""
 NOSE_RANGE = (0.2, 1.5)
