@@ -183,7 +183,7 @@ def errors_mm(model: head.HeadModel, made: StandIn) -> torch.Tensor:
 
 
 def test_landmarks_lie_where_they_should(flame: head.HeadModel, made: StandIn) -> None:
-    """The detector itself wanders by 1.6 mm in the median, 1.1 mm on the lips, 3 mm and more along the face's edge."""
+    """The detector itself wanders by 1.6 mm in the median, 1.1 on the lips, 3 and more along the face's edge."""
     off = errors_mm(flame, made)
     assert off[:468].median() < 1.2 and off[:468].mean() < 1.8
     assert off[list(LIPS)].mean() < 1.0 and off[list(EYES)].mean() < 1.0
@@ -240,7 +240,7 @@ def test_lids_close(flame: head.HeadModel) -> None:
 
 
 def test_the_mouth_lies_behind_the_lips(flame: head.HeadModel) -> None:
-    """3DGB's cylinder for FLAME: radius 27 mm, half height 22 mm; its arches are 48 mm wide, 20 mm deep, 11 mm high."""
+    """3DGB's cylinder: radius 27 mm, half height 22 mm; its arches: 48 mm wide, 20 mm deep, 11 mm high."""
     upper, lower = mouth_points(flame, flame.template, 400, 0)
     lips = flame.template[flame.regions["lips"] > 0.5]
     for points in (upper, lower):
