@@ -7,7 +7,6 @@ arrays, its surface by warped and remeshed heads whose truth is known.
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,9 +14,6 @@ import numpy as np
 import pytest
 import torch
 from flame_standin import StandIn, regressor, stand_in
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "assets"))
-
 from old_pickles import ch, dumps, sparse
 
 from toonifygb import head

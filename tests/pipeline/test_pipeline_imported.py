@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "datasets"))
-
 from dataset_makers import HEIGHT, N_FRAMES, insta_folder, tiny_flame
 
 from toonifygb import avatar, datasets, head, track, train

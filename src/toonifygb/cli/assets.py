@@ -102,7 +102,7 @@ def _importer(name: str, terminal: Terminal) -> Importer:
 
     kind = find(name).kind
     if kind == "flame":
-        return _flame_importer(name)
+        return _flame_importer(name, terminal)
     if kind != "styleganex":
         raise InputError(f"files of the kind '{kind}' cannot be converted by this version", "update toonifygb")
 
@@ -114,11 +114,11 @@ def _importer(name: str, terminal: Terminal) -> Importer:
     return convert
 
 
-def _flame_importer(name: str) -> Importer:
+def _flame_importer(name: str, terminal: Terminal) -> Importer:
     def convert(source: Path, target: Path) -> None:
         from toonifygb.head.flame_file import convert_flame
 
-        convert_flame(source, target, name)
+        convert_flame(source, target, name, progress=_Late(terminal, "fitting landmarks to it"))
 
     return convert
 

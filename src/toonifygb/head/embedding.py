@@ -15,12 +15,14 @@ from toonifygb.geometry.closest import Surface, closest_on_triangle
 from toonifygb.geometry.meshes import barycentric, vertex_normals
 from toonifygb.head.base import JOINTS, PARTS
 from toonifygb.head.registration import REACH, Registration, register
+from toonifygb.progress import SILENT
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from torch import Tensor
 
     from toonifygb.head.base import HeadModel
+    from toonifygb.progress import Progress
 
 N_SKIN = 468
 """Landmarks of the skin; behind them five of the right iris, then five of the left."""
@@ -44,18 +46,19 @@ def eyeballs(skin_weights: Float[Tensor, "v 5"]) -> Int[Tensor, " v"]:
     return part
 
 
-def furnish(rig: HeadModel, known: HeadModel) -> tuple[HeadModel, Registration]:
+def furnish(rig: HeadModel, known: HeadModel, *, progress: Progress = SILENT) -> tuple[HeadModel, Registration]:
     """The rig with landmarks, regions and, where it has none, lids.
 
     Args:
         rig: a head with ``part``, float32.
         known: the head that has them, float32.
+        progress: told while the known head is brought onto the rig.
 
     Returns:
         The furnished rig, and how the known head lies on it.
     """
     skin = _skin(rig)
-    registration = register(known, rig, skin)
+    registration = register(known, rig, skin, progress=progress)
     vertices = registration.vertices.float()
     landmarks = _landmarks(rig, known, skin, vertices, registration)
     face_ids, mix, near = _on_known(rig, known, vertices)

@@ -17,12 +17,14 @@ from toonifygb.errors import InputError
 from toonifygb.geometry.closest import Surface
 from toonifygb.geometry.meshes import vertex_normals
 from toonifygb.geometry.rotations import axis_angle_to_matrix
+from toonifygb.progress import SILENT
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from torch import Tensor
 
     from toonifygb.head.base import HeadModel
+    from toonifygb.progress import Progress
 
 JAW, EYES = 2, (3, 4)
 """Joints: the jaw's, and those at the centres of the eyeballs."""
@@ -69,22 +71,23 @@ class Registration:
     """Between the matched points of the face and the other surface, m."""
 
 
-def register(moving: HeadModel, other: HeadModel, still: Surface) -> Registration:
+def register(moving: HeadModel, other: HeadModel, still: Surface, *, progress: Progress = SILENT) -> Registration:
     """Brings a head onto a surface.
 
     Args:
         moving: a head with regions; its skin is matched.
         other: a head with eyes and a jaw; y up, z out of the face to within some 30 degrees.
         still: its skin.
+        progress: told after every round.
 
     Raises:
         InputError: the other head has no mouth.
     """
     moving, other = moving.to(torch.float64), other.to(torch.float64)
-    shape, frame = _fit_identity(moving, other, _Matcher(moving, still, COARSE))
+    shape, frame = _fit_identity(moving, other, _Matcher(moving, still, COARSE), progress)
     match = _Matcher(moving, still)
     placed = frame.apply(moving.rest(shape))
-    warped = _warp(moving, match, placed)
+    warped = _warp(match, placed, progress)
     weights, _, planes, _ = match(warped, LAST_GATE)
     distance = planes[weights > 0].abs()
     return Registration(warped, frame.scale * frame.rotation, distance)
@@ -188,7 +191,9 @@ def _boundary(surface: Surface) -> Float[Tensor, " v"]:
     return mask
 
 
-def _fit_identity(moving: HeadModel, other: HeadModel, match: _Matcher) -> tuple[Float[Tensor, " s"], _Frame]:
+def _fit_identity(
+    moving: HeadModel, other: HeadModel, match: _Matcher, progress: Progress
+) -> tuple[Float[Tensor, " s"], _Frame]:
     """Identity coefficients and similarity under which the head lies on the surface."""
     n_shape = moving.n_shape
     shape = torch.zeros(n_shape, dtype=torch.float64)
@@ -227,6 +232,7 @@ def _fit_identity(moving: HeadModel, other: HeadModel, match: _Matcher) -> tuple
         right[7:] += prior * shape
         change = -torch.linalg.solve(system, right)
         frame, shape = frame.moved(change[:7]), shape + change[7:]
+        progress.update(step + 1, ROUNDS + WARP_ROUNDS)
     return shape, frame
 
 
@@ -237,7 +243,7 @@ def _levers(arms: Float[Tensor, "n 3"], basis: Float[Tensor, "n 3 s"]) -> Float[
     return torch.cat([turn.mT, identity, arms[..., None], basis], -1)
 
 
-def _warp(moving: HeadModel, match: _Matcher, placed: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3"]:
+def _warp(match: _Matcher, placed: Float[Tensor, "v 3"], progress: Progress) -> Float[Tensor, "v 3"]:
     """The placed head with smooth displacements that bring it onto the surface."""
     features = torch.cat([_process(placed, match.ids, *warp) for warp in WARPS], -1)
     n_features = features.shape[1]
@@ -258,6 +264,7 @@ def _warp(moving: HeadModel, match: _Matcher, placed: Float[Tensor, "v 3"]) -> F
         right = (rows * (tight * distance)[:, None]).sum(0)
         right += (here.T @ (offset * loose[:, None])).flatten() + drawn.flatten()
         drawn = drawn - torch.linalg.solve(system, right).view(-1, 3)
+        progress.update(ROUNDS + step + 1, ROUNDS + WARP_ROUNDS)
     return placed + features @ drawn
 
 
