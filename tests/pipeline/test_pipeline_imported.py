@@ -82,6 +82,8 @@ def test_mistakes_are_one_sentence(flame: None, tmp_path: Path, capsys: pytest.C
     command = ["import", str(tmp_path / "theirs"), "--out", str(tmp_path / "run"), "--quiet"]
     assert run([*command, "--style", "toon"]) == 2
     assert "overdraws eyes and chin" in capsys.readouterr().err
+    assert run([*command, "--head", "flame2042"]) == 2
+    assert "there is no head model 'flame2042', known are open, flame, flame2023" in capsys.readouterr().err
     pictures = tmp_path / "theirs" / "images"
     assert run(["import", str(pictures), "--out", str(tmp_path / "run"), "--quiet"]) == 2
     assert "is no dataset of a kind that can be read (insta, flashavatar, tracker, vhap)" in capsys.readouterr().err

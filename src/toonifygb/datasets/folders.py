@@ -44,6 +44,12 @@ class Picture:
         """Whether the dataset says where the head is."""
         return self.alpha is not None or bool(self.masks)
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Every file that makes the picture, once."""
+        parts = (self.image, self.alpha, *self.masks, self.parsing)
+        return tuple(dict.fromkeys(part for part in parts if part is not None))
+
 
 @dataclass(frozen=True)
 class ForeignFolder:

@@ -15,7 +15,7 @@ import torch
 from toonifygb import datasets, head, track, train, video
 from toonifygb.errors import InputError
 from toonifygb.pipeline.files import LANDMARK_TRACK, load_landmarks
-from toonifygb.pipeline.source import open_style
+from toonifygb.pipeline.source import head_name, open_style
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -50,8 +50,8 @@ def check_style(source: Source, config: RunConfig) -> None:
 def foreign_track(source: Source, config: RunConfig) -> datasets.ForeignTrack:
     """The dataset's track in our world, with landmarks where its head model has them."""
     assert source.foreign is not None, "the source is no dataset"
-    name = source.foreign.head if config.head == "open" else config.head
-    return datasets.read_track(source.foreign, head.load(name), fps=source.info.fps, source_sha256=source.sha256)
+    model = head.load(head_name(config, source.foreign))
+    return datasets.read_track(source.foreign, model, fps=source.info.fps, source_sha256=source.sha256)
 
 
 def unseen_landmarks(source: Source, config: RunConfig) -> Landmarks:

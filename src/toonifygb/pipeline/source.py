@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from toonifygb import datasets, stylize, video
+from toonifygb import datasets, head, stylize, video
 from toonifygb.structures import VideoInfo
 
 if TYPE_CHECKING:
@@ -50,22 +50,29 @@ class Source:
 
 
 def open_source(clip: Path, config: RunConfig) -> Source:
-    """The clip or dataset, probed and hashed; the style checked too, so that a wrong request fails before any work.
+    """The clip or dataset, probed and hashed; style and head model checked: wrong requests fail before any work.
 
     Raises:
-        InputError: no such file, not a video, no frames, or an unknown style.
+        InputError: no such file, not a video, no frames, or an unknown style or head model.
+        AssetError: a head model that has not been added.
     """
     foreign = datasets.recognize(clip)
     open_style(config)
+    head.load(head_name(config, foreign))
     if foreign is None:
         return Source(clip, video.probe(clip), video.source_sha256(clip))
     foreign = foreign.first(config.max_frames)
     height, width = video.load_rgba(foreign.pictures[0].image).shape[:2]
     info = VideoInfo(str(clip), width, height, datasets.FPS, len(foreign.ids), has_audio=False)
     whole = hashlib.sha256()
-    for file in (*foreign.parameters, *(picture.image for picture in foreign.pictures)):
+    for file in (*foreign.parameters, *(file for picture in foreign.pictures for file in picture.files)):
         whole.update(bytes.fromhex(video.source_sha256(file)))
     return Source(clip, info, whole.hexdigest(), foreign)
+
+
+def head_name(config: RunConfig, foreign: datasets.ForeignFolder | None) -> str:
+    """The head model of a run: the one asked for, or else that of a dataset's track."""
+    return foreign.head if foreign is not None and config.head == "open" else config.head
 
 
 def open_style(config: RunConfig) -> Stylizer:
