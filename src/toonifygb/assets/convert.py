@@ -133,7 +133,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
     Raises:
         AssetError: the file is absent, damaged, or holds more than tensors and plain values.
     """
-    return _read(path, lambda data: (_read_archive if data[:4] == _ZIP_START else _read_stream)(data, path))
+    return _read(path, "checkpoint of torch", lambda data: _reader(data)(data, path))
 
 
 def read_pickle(path: Path) -> Checkpoint:
@@ -146,13 +146,20 @@ def read_pickle(path: Path) -> Checkpoint:
     def outside(*_: object) -> _Storage:
         raise AssetError(f"{path} refers to numbers outside of it")
 
-    return _read(path, lambda data: _run(data[: _inspect(data, path, _MOST_MODEL_BYTES)], outside, path))
+    def reader(data: memoryview) -> Any:
+        return _run(data[: _inspect(data, path, _MOST_MODEL_BYTES)], outside, path)
+
+    return _read(path, "pickle of arrays", reader)
 
 
-def _read(path: Path, reader: Callable[[memoryview], Any]) -> Checkpoint:
+def _reader(data: memoryview) -> Callable[[memoryview, Path], Any]:
+    return _read_archive if data[:4] == _ZIP_START else _read_stream
+
+
+def _read(path: Path, kind: str, reader: Callable[[memoryview], Any]) -> Checkpoint:
     """What the reader makes of a file's bytes, if that is a dict."""
     if not path.is_file():
-        raise AssetError(f"{path} does not exist; expected a checkpoint (.pt)", "check the path")
+        raise AssetError(f"{path} does not exist; expected a {kind}", "check the path")
     if path.stat().st_size == 0:
         raise AssetError(f"{path} is empty", "download it again")
     with path.open("rb") as file:
@@ -164,9 +171,9 @@ def _read(path: Path, reader: Callable[[memoryview], Any]) -> Checkpoint:
     # A damaged pickle fails in any way the interpreter can; all of them mean the same.
     except Exception as error:
         said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise AssetError(f"{path} is damaged or no checkpoint of torch ({said})", "download it again") from error
+        raise AssetError(f"{path} is damaged or no {kind} ({said})", "download it again") from error
     if not isinstance(value, dict):
-        raise AssetError(f"{path} holds no named tensors; expected a checkpoint of a network")
+        raise AssetError(f"{path} holds no named tensors; expected a {kind}")
     return Checkpoint(path, value)
 
 

@@ -88,7 +88,8 @@ def head_to_camera(
     The turn of the neck goes into it: skull, face, jaw and eyes end up where they were; the neck's own skin,
     which such trackers hold stiff, does not follow.
     """
-    _, transforms = head.forward(shape, motion)
+    # The joints are asked for; of a whole clip's vertices there would be gigabytes.
+    _, transforms = head.subset(torch.zeros(1, dtype=torch.int64)).forward(shape, motion)
     skull = transforms[:, NECK]
     camera, place = world_to_camera[:3, :3], world_to_camera[:3, 3]
     rotation = camera @ skull[:, :3, :3]
