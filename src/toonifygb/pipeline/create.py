@@ -20,7 +20,7 @@ from toonifygb import datasets, face, head, stylize, track, train, video
 from toonifygb.config import from_json, to_json
 from toonifygb.errors import FaceError, InputError
 from toonifygb.pipeline import imported
-from toonifygb.pipeline.files import LANDMARK_TRACK, load_landmarks, save_landmarks
+from toonifygb.pipeline.files import LANDMARK_TRACK, load_landmarks, open_crops, save_landmarks
 from toonifygb.pipeline.outcome import outcome
 from toonifygb.pipeline.segments import SEGMENT, Segments
 from toonifygb.pipeline.source import Source, open_style, style_inputs
@@ -264,7 +264,7 @@ def finish_track(run: Run, config: RunConfig, fitted: str, cut: str | None) -> s
         sequence = track.load(run.work(LANDMARK_TRACK))
         if dataset is not None:
             sequence = train.refine_track(
-                train.load_dataset(run.work("dataset")),
+                open_crops(run, sequence),
                 sequence,
                 head.load(sequence.head_model),
                 seed=config.train.seed,
@@ -316,7 +316,7 @@ def cut_dataset(source: Source, run: Run, config: RunConfig, fitted: str, styled
     def work(progress: Progress) -> None:
         sequence = track.load(run.work(LANDMARK_TRACK))
         model = head.load(sequence.head_model)
-        if source.foreign is not None and source.foreign.pictures[0].has_matte:
+        if imported.own_mattes(source):
             pairs = imported.head_pictures(source, run, config)
             train.build_dataset(pairs, sequence, model, training, out, progress=progress)
             return
@@ -378,7 +378,7 @@ def train_avatar(run: Run, config: RunConfig, cut: str, tracked: str) -> str:
     def work(progress: Progress) -> None:
         sequence = track.load(run.file("track.safetensors"))
         trained = train.train(
-            train.load_dataset(run.work("dataset")),
+            open_crops(run, sequence),
             sequence,
             head.load(sequence.head_model),
             config.train,
@@ -387,6 +387,6 @@ def train_avatar(run: Run, config: RunConfig, cut: str, tracked: str) -> str:
             threads=config.threads,
             progress=progress,
         )
-        avatars.save(trained, out)
+        avatars.save(trained, out, storage=config.train.storage)
 
     return run.stage("train", "training the avatar", inputs=[cut, tracked, config.train], outputs=[out], work=work)

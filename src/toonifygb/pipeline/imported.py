@@ -62,6 +62,8 @@ def unseen_landmarks(source: Source, config: RunConfig) -> Landmarks:
 
 def take_track(source: Source, run: Run, config: RunConfig, found: str) -> str:
     """The dataset's track, beside the landmarks found in its pictures."""
+    foreign = source.foreign
+    assert foreign is not None, "the source is no dataset"
     out = run.work(LANDMARK_TRACK)
 
     def work(progress: Progress) -> None:
@@ -71,11 +73,16 @@ def take_track(source: Source, run: Run, config: RunConfig, found: str) -> str:
         errors = track.landmark_errors(sequence, head.load(sequence.head_model))
         errors = torch.where(landmarks.score > 0, errors, torch.nan)
         run.problems("track", list(read.problems))
-        run.state["track_on"] = {"choice": "imported", "reason": source.foreign.layout if source.foreign else ""}
+        run.state["track_on"] = {"choice": "imported", "reason": foreign.layout, "own_mattes": own_mattes(source)}
         track.save(replace(sequence, error_px=errors), out)
         progress.update(1, 1)
 
     return run.stage("track", "taking the track", inputs=[found, config.head], outputs=[out], work=work)
+
+
+def own_mattes(source: Source) -> bool:
+    """Whether the source is a dataset that says where the head is."""
+    return source.foreign is not None and source.foreign.pictures[0].has_matte
 
 
 def train_config(source: Source, config: RunConfig) -> TrainConfig:
