@@ -251,7 +251,7 @@ def import_(
     out: Path,
     style: str = "none",
     quality: Quality = "standard",
-    head: str = "open",
+    head: str | None = None,
     max_frames: int | None = None,
     settings: tuple[str, ...] = (),
     quiet: bool = False,
@@ -263,7 +263,7 @@ def import_(
         out: Folder of the run.
         style: none, or a style that keeps the face's shape (arcane, cartoon, pixar, a model file).
         quality: draft (minutes), standard, or paper (the published regime).
-        head: FLAME version of the track where the layout's usual one is wrong: flame or flame2023.
+        head: FLAME version of the track, flame or flame2023; what such datasets usually have when unset.
         max_frames: Use only the first frames.
         settings: Any other setting by name, for instance track.photometric=true to refine the head's poses.
         quiet: Say nothing but errors.
@@ -273,7 +273,7 @@ def import_(
     from toonifygb.pipeline.stages import Run
 
     run_config = RunConfig(
-        head=head,
+        head=head or "open",
         quality=quality,
         stylize=StylizeConfig(style=style),
         # Poses of these trackers were fitted to the pixels already, and pictures are crops of the head already.
