@@ -24,7 +24,7 @@ FLOORS = {
     0: ("structures", "errors", "progress", "threads", "atomic"),
     1: ("geometry", "metrics", "assets", "config"),
     2: ("video", "face", "head", "stylize", "render"),
-    3: ("avatar", "track", "synthetic"),
+    3: ("avatar", "track", "synthetic", "datasets"),
     4: ("train", "drive"),
     5: ("evaluate", "viewer"),
     6: ("pipeline",),

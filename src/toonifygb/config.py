@@ -142,6 +142,8 @@ class TrainConfig:
 class RunConfig:
     """A whole run from clip to avatar."""
 
+    head: str = "open"
+    """Head model: open, or one that you added, flame or flame2023 (toonifygb assets add flame)."""
     quality: Quality = "standard"
     """draft: minutes; standard: a coffee; paper: the published regime."""
     stylize: StylizeConfig = field(default_factory=StylizeConfig)
@@ -157,6 +159,8 @@ class RunConfig:
     """Threads of the native engine; all cores when unset."""
 
 
+WHOLE_PICTURE = 100.0
+"""A ``crop_scale`` with which the largest square of the picture is taken, whatever the face's size."""
 DRAFT = TrainConfig()
 STANDARD = TrainConfig(n_gaussians=32_000, n_mouth_gaussians=4_000, resolution=512, steps=6_000)
 PAPER = TrainConfig(n_gaussians=50_000, n_mouth_gaussians=14_000, resolution=512, steps=40_000, sh_degree=3)

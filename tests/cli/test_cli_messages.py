@@ -144,7 +144,7 @@ def test_message(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["--help"]) == 0
     text = capsys.readouterr().out
-    for name in ("create", "demo", "stylize", "track", "train", "render", "doctor"):
+    for name in ("create", "demo", "stylize", "track", "train", "render", "import", "export", "doctor"):
         assert f"  {name} " in text
 
 

@@ -152,7 +152,7 @@ def test_gradients_reach_shape_and_motion(open_head: head.HeadModel) -> None:
 
 
 def test_unknown_model_is_named() -> None:
-    with pytest.raises(InputError, match="no head model 'flame2042', known are open"):
+    with pytest.raises(InputError, match="no head model 'flame2042', known are open, flame, flame2023"):
         head.load("flame2042")
 
 

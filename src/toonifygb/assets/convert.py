@@ -1,4 +1,6 @@
-"""From a checkpoint of torch (``.pt``) to safetensors, without running any of the code that a checkpoint can hold.
+"""Other people's pickles, read without running any of the code that a pickle can hold.
+
+Checkpoints of torch (``.pt``, trackers' ``.frame``) and plain pickles of arrays (models of the SMPL family).
 
 The only file of the package that unpickles. A checkpoint is a pickle, a small program that builds objects, beside
 raw numbers. Here the program is first read as a list of instructions and measured (``_inspect``); then it is run by
@@ -6,6 +8,7 @@ an unpickler that knows nothing but the names in ``_names``, each of which stand
 becomes a ``StoredTensor``, a note of where its numbers lie. Numbers are touched only when they are written.
 
 Both layouts of ``torch.save`` are read: the zip archive (since torch 1.6) and the older single stream.
+Arrays of numpy become ``StoredTensor`` too; objects of scipy and chumpy become dicts of their parts.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from toonifygb.assets import pickled
 from toonifygb.assets.archive import StoredArchive
 from toonifygb.atomic import replacing
 from toonifygb.errors import AssetError
@@ -48,6 +52,8 @@ _STORAGES = {
 _NUMPY_SCALARS = {"f8": "<f8", "f4": "<f4", "i8": "<i8", "i4": "<i4", "b1": "?"}
 _MOST_PICKLE_BYTES = 32 * 2**20
 """A network of 2000 tensors needs less than one."""
+_MOST_MODEL_BYTES = 256 * 2**20
+"""A plain pickle holds its numbers itself; those of FLAME take 50."""
 _MOST_VALUES, _MOST_DEPTH = 200_000, 32
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 _LEGACY_PROTOCOL = 1001
@@ -127,22 +133,47 @@ def read_checkpoint(path: Path) -> Checkpoint:
     Raises:
         AssetError: the file is absent, damaged, or holds more than tensors and plain values.
     """
+    return _read(path, "checkpoint of torch", lambda data: _reader(data)(data, path))
+
+
+def read_pickle(path: Path) -> Checkpoint:
+    """A plain pickle of named arrays; they stay in it until they are asked for.
+
+    Raises:
+        AssetError: the file is absent, damaged, or holds more than arrays and plain values.
+    """
+
+    def outside(*_: object) -> _Storage:
+        raise AssetError(f"{path} refers to numbers outside of it")
+
+    def reader(data: memoryview) -> Any:
+        return _run(data[: _inspect(data, path, _MOST_MODEL_BYTES)], outside, path)
+
+    return _read(path, "pickle of arrays", reader)
+
+
+def _reader(data: memoryview) -> Callable[[memoryview, Path], Any]:
+    return _read_archive if data[:4] == _ZIP_START else _read_stream
+
+
+def _read(path: Path, kind: str, reader: Callable[[memoryview], Any]) -> Checkpoint:
+    """What the reader makes of a file's bytes, if that is a dict."""
     if not path.is_file():
-        raise AssetError(f"{path} does not exist; expected a checkpoint (.pt)", "check the path")
+        raise AssetError(f"{path} does not exist; expected a {kind}", "check the path")
     if path.stat().st_size == 0:
         raise AssetError(f"{path} is empty", "download it again")
     with path.open("rb") as file:
         data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
     try:
-        value = (_read_archive if data[:4] == _ZIP_START else _read_stream)(data, path)
+        value = reader(data)
     except AssetError:
         raise
     # A damaged pickle fails in any way the interpreter can; all of them mean the same.
     except Exception as error:
         said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise AssetError(f"{path} is damaged or no checkpoint of torch ({said})", "download it again") from error
+        raise AssetError(f"{path} is damaged or no {kind} ({said})", "download it again") from error
     if not isinstance(value, dict):
-        raise AssetError(f"{path} holds no named tensors; expected a checkpoint of a network")
+        raise AssetError(f"{path} holds no named tensors; expected a {kind}")
     return Checkpoint(path, value)
 
 
@@ -204,14 +235,14 @@ def _read_stream(data: memoryview, path: Path) -> Any:
     return value
 
 
-def _inspect(program: memoryview, path: Path) -> int:
+def _inspect(program: memoryview, path: Path, most_bytes: int = _MOST_PICKLE_BYTES) -> int:
     """Length of the pickle at the start of ``program``, whose instructions are looked at but not run.
 
     Raises:
         AssetError: it names anything beyond the names we know, or asks for more memory than it can fill.
     """
     known = set(_names())
-    if len(program) > _MOST_PICKLE_BYTES:
+    if len(program) > most_bytes:
         raise AssetError(f"{path} describes its tensors in {len(program)} bytes; more than any network needs")
     for count, (instruction, argument, position) in enumerate(pickletools.genops(program.tobytes())):
         name = instruction.name
@@ -237,59 +268,59 @@ class _Namespace:
     """Stands for ``argparse.Namespace``: options by name."""
 
     def __init__(self) -> None:
-        self.options: dict[str, Any] = {}
+        self.options: Any = {}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.options = dict(state)
+    def __setstate__(self, state: Any) -> None:
+        self.options = state
 
 
-class _Dtype:
-    """Stands for ``numpy.dtype`` of a scalar."""
+class _Room:
+    """What calls may still copy: a pickle that calls again and again on one long value would fill any memory."""
 
-    def __init__(self, code: str, *_: object) -> None:
-        self.code = code
+    def __init__(self, size: int) -> None:
+        self._left = size
 
-    def __setstate__(self, state: object) -> None:
-        """Byte order and alignment, which scalars do not need."""
+    def take(self, arguments: tuple[Any, ...]) -> None:
+        """Pays for one call, which makes at most as much as it is given.
+
+        Raises:
+            AssetError: there is no room left.
+        """
+        self._left -= sum(len(each) for each in arguments if isinstance(each, str | bytes | list | tuple | dict))
+        if self._left < 0:
+            raise AssetError("the file copies the same values again and again; no checkpoint does", _KEEP_OUT)
 
 
 class _Call(_Sealed):
     """A function of ours under a name of the checkpoint's."""
 
-    __slots__ = ("_function",)
+    __slots__ = ("_function", "_room")
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self._function = function
+    def __init__(self, function: Callable[..., Any], room: _Room) -> None:
+        self._function, self._room = function, room
 
     def __call__(self, *arguments: Any) -> Any:
         """The function's answer."""
+        self._room.take(arguments)
         return self._function(*arguments)
 
 
-def _names() -> dict[tuple[str, str], Any]:
+def _names(room: _Room | None = None) -> dict[tuple[str, str], Any]:
     """Everything a checkpoint may name, and what stands for it.
 
-    No pickle can change what stands here for the next one: functions are sealed, the one class is new each time.
+    No pickle can change what stands here for the next one: functions are sealed, classes are new each time.
     """
-    scalar, tensor, first = _Call(_scalar), _Call(_tensor), _Call(lambda value, *_: value)
-    names = {
-        ("collections", "OrderedDict"): OrderedDict,
-        ("torch._utils", "_rebuild_tensor_v2"): tensor,
-        ("torch._utils", "_rebuild_tensor"): tensor,
-        ("torch._utils", "_rebuild_parameter"): first,
-        ("torch.nn.parameter", "Parameter"): first,
-        ("torch", "Size"): _Call(tuple),
-        ("torch", "device"): _Call(lambda kind, *_: kind),
-        ("argparse", "Namespace"): type("_Namespace", (_Namespace,), {}),
-        ("numpy", "dtype"): _Call(_Dtype),
-        ("numpy.core.multiarray", "scalar"): scalar,
-        ("numpy._core.multiarray", "scalar"): scalar,
-        ("_codecs", "encode"): _Call(lambda text, _: text.encode("latin1")),
-    }
-    return names | {("torch", kind): kind for kind in _STORAGES}
+    room = room or _Room(0)
+    names: dict[tuple[str, str], Any] = {name: _Call(function, room) for name, function in _FUNCTIONS.items()}
+    for place in ("numpy.core.multiarray", "numpy._core.multiarray"):
+        names[place, "scalar"] = _Call(_scalar, room)
+        names[place, "_reconstruct"] = _Call(lambda *_: pickled.Array(), room)
+    names["argparse", "Namespace"] = type("_Namespace", (_Namespace,), {})
+    names |= {("numpy", "ndarray"): "array", ("__builtin__", "object"): "object", ("builtins", "object"): "object"}
+    return names | pickled.bags() | {("torch", kind): kind for kind in _STORAGES}
 
 
-def _scalar(dtype: _Dtype, data: bytes) -> float | int | bool:
+def _scalar(dtype: pickled.Dtype, data: bytes) -> float | int | bool:
     """Value of a numpy scalar."""
     return np.frombuffer(data, _NUMPY_SCALARS[dtype.code])[0].item()
 
@@ -311,9 +342,29 @@ def _tensor(storage: Any, offset: int, size: Any, stride: Any, *_: object) -> St
     return StoredTensor(storage, offset, shape, strides)
 
 
+_FUNCTIONS: dict[tuple[str, str], Callable[..., Any]] = {
+    ("collections", "OrderedDict"): OrderedDict,
+    ("torch._utils", "_rebuild_tensor_v2"): _tensor,
+    ("torch._utils", "_rebuild_tensor"): _tensor,
+    ("torch._utils", "_rebuild_parameter"): lambda value, *_: value,
+    ("torch.nn.parameter", "Parameter"): lambda value, *_: value,
+    ("torch", "Size"): tuple,
+    ("torch", "device"): lambda kind, *_: kind,
+    ("numpy", "dtype"): pickled.Dtype,
+    ("_codecs", "encode"): lambda text, _: text.encode("latin1"),
+    ("copy_reg", "_reconstructor"): pickled.rebuilt,
+    ("copyreg", "_reconstructor"): pickled.rebuilt,
+    # Sets are caches of chumpy's; nothing of theirs is wanted.
+    ("__builtin__", "set"): lambda *_: None,
+    ("builtins", "set"): lambda *_: None,
+}
+"""What stands for the functions that a checkpoint may call."""
+
+
 def _run(program: memoryview, stored: Callable[[str, str, int], _Storage], path: Path) -> Any:
     """The value that the pickle builds, freed of stand-ins."""
-    names = _names()
+    # Every character of a pickle is worth one: what it writes down once it may turn into something else once.
+    names = _names(_Room(len(program)))
 
     class Restricted(pickle.Unpickler):
         """An unpickler that finds the known names and nothing else."""
@@ -342,6 +393,10 @@ def _plain(value: Any, path: Path) -> Any:
             raise AssetError(f"{path} holds more values, or more deeply nested ones, than any network needs")
         if isinstance(item, _Namespace):
             item = item.options
+        if isinstance(item, pickled.Bag):
+            item = item.parts()
+        if isinstance(item, pickled.Array):
+            return _stored(item)
         if isinstance(item, dict):
             return {key: walk(inner, depth + 1) for key, inner in item.items()}
         if isinstance(item, list | tuple | set | frozenset):
@@ -351,6 +406,13 @@ def _plain(value: Any, path: Path) -> Any:
         raise AssetError(f"{path} holds a {type(item).__name__} where plain values are expected")
 
     return walk(value, 0)
+
+
+def _stored(array: pickled.Array) -> StoredTensor:
+    """An array of numpy as a tensor whose numbers lie in the pickle itself."""
+    array.bytes()
+    storage = _Storage(array.dtype, math.prod(array.shape), array.bytes, lambda: None)
+    return StoredTensor(storage, 0, array.shape, array.strides)
 
 
 def write_safetensors(

@@ -40,11 +40,28 @@ class Asset:
     pages: tuple[str, ...]
     """Where a person finds it."""
     nearest_style: str
-    """Built-in style that needs no file and comes closest."""
+    """Built-in style that needs no file and comes closest; empty for other things than styles."""
+    nearest_head: str
+    """The same for a head model."""
+    sign_up: str
+    """Where a person registers to be given the file; empty where it can be downloaded."""
     size_bytes: int | None
     """None where nobody has published it."""
     sha256: str | None
     """None where nobody has published it."""
+
+    @property
+    def instead(self) -> str:
+        """What needs no file, for messages."""
+        return (
+            f"the style '{self.nearest_style}'" if self.nearest_style else f"the head model '{self.nearest_head}'"
+        )
+
+    @property
+    def by_hand(self) -> str:
+        """How a person who registered adds it, for messages."""
+        add = f"toonifygb assets add {self.name} {self.file}"
+        return f"register at {self.sign_up}, download {self.file} and run: {add}"
 
 
 @cache
@@ -69,7 +86,9 @@ def read_manifest(path: Path) -> dict[str, Asset]:
             citation=work["citation"],
             urls=tuple(entry["urls"]),
             pages=(*entry["pages"], *work["pages"]),
-            nearest_style=entry["nearest_style"],
+            nearest_style=entry.get("nearest_style", ""),
+            nearest_head=entry.get("nearest_head", ""),
+            sign_up=entry.get("sign_up", ""),
             size_bytes=entry.get("bytes"),
             sha256=entry.get("sha256"),
         )

@@ -74,9 +74,10 @@ def model_path(name: str) -> Path:
     asset = find(name)
     path = _model(asset)
     if not (path.is_file() and _note(asset).is_file()):
+        way = asset.by_hand if asset.sign_up else f"toonifygb assets get {name}"
         raise AssetError(
             f"the model '{name}' is not in {path.parent}",
-            f"toonifygb assets get {name}, or use the style '{asset.nearest_style}', which needs no model",
+            f"{way}, or use {asset.instead}, which needs none",
         )
     return path
 
@@ -86,12 +87,15 @@ def get(name: str, importer: Importer, consent: Consent, *, progress: Progress =
 
     Raises:
         InputError: no such asset.
-        AssetError: the licence was declined, the file cannot be had, or it is not what it should be.
+        AssetError: the licence was declined, the file cannot be had (some authors want to know their users), or it
+            is not what it should be.
         Stopped: the user asked to stop; the next call goes on.
     """
     asset = find(name)
     if _model(asset).is_file() and _note(asset).is_file():
         return _model(asset)
+    if asset.sign_up:
+        raise AssetError(f"{name} is given by its authors to registered users only", asset.by_hand)
     _agree(asset, consent)
     source = cache_folder() / "downloads" / asset.file
     # A complete file is left here when the user stopped its conversion.
@@ -191,7 +195,7 @@ def _fetch(asset: Asset, source: Path, progress: Progress) -> str:
     raise AssetError(
         f"{asset.name} could not be downloaded: {said}",
         f"{again}download {asset.file} yourself from {asset.pages[0]} and run: "
-        f"toonifygb assets add {asset.name} {asset.file}; the style '{asset.nearest_style}' needs no model",
+        f"toonifygb assets add {asset.name} {asset.file}; {asset.instead} needs no model",
     )
 
 

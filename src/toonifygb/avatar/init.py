@@ -85,7 +85,7 @@ def init_avatar(
         views: training images for hair and colours; without them the head is bald and grey.
     """
     rest = head.rest(shape)
-    n_expressions = head.n_expression if config.n_bases is None else min(config.n_bases, head.n_expression)
+    n_expressions = min(config.n_bases or head.n_blendshapes or head.n_expression, head.n_expression)
     face = _face_set(head, rest, n_expressions, config, views)
     names = list(head.expression_names[:n_expressions])
     n_eyelids = 0 if head.eyelid_basis is None else 2

@@ -101,6 +101,8 @@ def _importer(name: str, terminal: Terminal) -> Importer:
     from toonifygb.assets.manifest import find
 
     kind = find(name).kind
+    if kind == "flame":
+        return _flame_importer(name, terminal)
     if kind != "styleganex":
         raise InputError(f"files of the kind '{kind}' cannot be converted by this version", "update toonifygb")
 
@@ -108,6 +110,15 @@ def _importer(name: str, terminal: Terminal) -> Importer:
         from toonifygb.stylize.styleganex.weights import convert_checkpoint
 
         convert_checkpoint(source, target, progress=_Late(terminal, f"converting {name}"))
+
+    return convert
+
+
+def _flame_importer(name: str, terminal: Terminal) -> Importer:
+    def convert(source: Path, target: Path) -> None:
+        from toonifygb.head.flame_file import convert_flame
+
+        convert_flame(source, target, name, progress=_Late(terminal, "fitting landmarks to it"))
 
     return convert
 

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from toonifygb.cli.assets import assets
 from toonifygb.cli.progress import Terminal
-from toonifygb.config import PRESETS, FaceConfig, Quality, RunConfig, StylizeConfig, TrackConfig, TrackOn, override
+from toonifygb.config import (
+    PRESETS,
+    WHOLE_PICTURE,
+    FaceConfig,
+    Quality,
+    RunConfig,
+    StylizeConfig,
+    TrackConfig,
+    TrackOn,
+    override,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -22,6 +33,7 @@ def create(
     quality: Quality = "standard",
     strength: float = 1.0,
     track_on: TrackOn = "auto",
+    head: str = "open",
     choose_face: str = "largest",
     max_frames: int | None = None,
     backend: str = "auto",
@@ -38,6 +50,7 @@ def create(
         quality: draft (minutes), standard, or paper (the published regime).
         strength: Blend between the original (0) and the full style (1).
         track_on: Video whose landmarks the head model is fitted to.
+        head: Head model: open, or flame or flame2023 once you have added it (toonifygb assets add flame).
         choose_face: Which face to follow: largest, left, right, centre, or a number counted from the left.
         max_frames: Use only the first frames.
         backend: Rasteriser: auto, native or reference.
@@ -46,6 +59,7 @@ def create(
         quiet: Say nothing but errors.
     """
     run_config = RunConfig(
+        head=head,
         quality=quality,
         stylize=StylizeConfig(style=style, strength=strength),
         face=FaceConfig(choose=choose_face),
@@ -117,6 +131,7 @@ def track(
     clip: Path,
     /,
     out: Path,
+    head: str = "open",
     choose_face: str = "largest",
     max_frames: int | None = None,
     settings: tuple[str, ...] = (),
@@ -127,6 +142,7 @@ def track(
     Args:
         clip: Video file or folder of images.
         out: Folder of the run.
+        head: Head model: open, or flame or flame2023 once you have added it (toonifygb assets add flame).
         choose_face: Which face to follow where several are visible.
         max_frames: Use only the first frames.
         settings: Any other setting by name, for instance track.iterations=40.
@@ -137,6 +153,7 @@ def track(
     from toonifygb.pipeline.stages import Run
 
     run_config = RunConfig(
+        head=head,
         stylize=StylizeConfig(style="none"),
         face=FaceConfig(choose=choose_face),
         max_frames=max_frames,
@@ -148,23 +165,31 @@ def track(
 
 
 def train(
-    run: Path, /, quality: Quality | None = None, settings: tuple[str, ...] = (), quiet: bool = False
+    run: Path,
+    /,
+    quality: Quality | None = None,
+    head: str | None = None,
+    settings: tuple[str, ...] = (),
+    quiet: bool = False,
 ) -> None:
     """Train the avatar of an existing run again, with other settings; earlier stages are kept.
 
     Args:
-        run: Folder that ``create`` made.
+        run: Folder that ``create`` or ``import`` made.
         quality: Another quality; the run's own when unset.
+        head: Another head model, with which the clip is tracked again; the run's own when unset.
         settings: Any setting by name, for instance train.steps=20000.
         quiet: Say nothing but errors.
     """
-    import dataclasses
-
     from toonifygb.pipeline.create import read_request
 
     clip, run_config = read_request(run)
     if quality:
-        run_config = dataclasses.replace(run_config, quality=quality, train=PRESETS[quality])
+        # What the crops show belongs to the clip rather than to the quality.
+        preset = dataclasses.replace(PRESETS[quality], crop_scale=run_config.train.crop_scale)
+        run_config = dataclasses.replace(run_config, quality=quality, train=preset)
+    if head:
+        run_config = dataclasses.replace(run_config, head=head)
     _create(clip, run, _with(run_config, settings), quiet)
 
 
@@ -220,6 +245,64 @@ def render(
     render_file(request, _terminal(quiet))
 
 
+def import_(
+    folder: Path,
+    /,
+    out: Path,
+    style: str = "none",
+    quality: Quality = "standard",
+    head: str | None = None,
+    max_frames: int | None = None,
+    settings: tuple[str, ...] = (),
+    quiet: bool = False,
+) -> None:
+    """Take a dataset of INSTA, 3DGB, FlashAvatar, metrical-tracker or VHAP as it is; then: toonifygb train RUN.
+
+    Args:
+        folder: The dataset: pictures and what its tracker left (checkpoint/*.frame or flame_param.npz).
+        out: Folder of the run.
+        style: none, or a style that keeps the face's shape (arcane, cartoon, pixar, a model file).
+        quality: draft (minutes), standard, or paper (the published regime).
+        head: FLAME version of the track, flame or flame2023; what such datasets usually have when unset.
+        max_frames: Use only the first frames.
+        settings: Any other setting by name, for instance track.photometric=true to refine the head's poses.
+        quiet: Say nothing but errors.
+    """
+    from toonifygb.pipeline.create import import_only
+    from toonifygb.pipeline.source import open_source
+    from toonifygb.pipeline.stages import Run
+
+    run_config = RunConfig(
+        head=head or "open",
+        quality=quality,
+        stylize=StylizeConfig(style=style),
+        # Poses of these trackers were fitted to the pixels already, and pictures are crops of the head already.
+        track=TrackConfig(photometric=False),
+        train=dataclasses.replace(PRESETS[quality], crop_scale=WHOLE_PICTURE),
+        max_frames=max_frames,
+    )
+    run_config = _with(run_config, settings)
+    terminal = _terminal(quiet)
+    source = open_source(folder, run_config)
+    with Run(out, terminal) as run:
+        import_only(source, run, run_config)
+    terminal.say(f"done: look at {out / 'overlay.mp4'}, then: toonifygb train {out}")
+
+
+def export(run: Path, /, out: Path, layout: Literal["insta", "3dgb"] = "insta", quiet: bool = False) -> None:
+    """Write a run's track and head crops as a dataset for INSTA or 3D Gaussian Blendshapes.
+
+    Args:
+        run: Folder that ``create``, ``train`` or ``import`` made, tracked with FLAME.
+        out: New folder for the dataset.
+        layout: insta (everything), or 3dgb (pictures and tracker files alone).
+        quiet: Say nothing but errors.
+    """
+    from toonifygb.pipeline.imported import export_run
+
+    export_run(run, out, layout, _terminal(quiet))
+
+
 def doctor() -> None:
     """Say what this machine has, what toonifygb will use, and what is wrong, if anything."""
     from toonifygb.cli.doctor import report
@@ -234,6 +317,8 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "track": track,
     "train": train,
     "render": render,
+    "import": import_,
+    "export": export,
     "assets": assets,
     "doctor": doctor,
 }

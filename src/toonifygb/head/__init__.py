@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from toonifygb.errors import InputError
 from toonifygb.head.base import JOINTS, PARENTS, PARTS, HeadModel
 from toonifygb.head.flame import from_arrays
+from toonifygb.head.flame_file import load_flame
 from toonifygb.head.open_head import load_open_head
 
 __all__ = ["JOINTS", "PARENTS", "PARTS", "HeadModel", "available", "from_arrays", "load", "load_open_head"]
 
-_LOADERS = {"open": load_open_head}
+_LOADERS = {
+    "open": load_open_head,
+    "flame": partial(load_flame, "flame"),
+    "flame2023": partial(load_flame, "flame2023"),
+}
 
 
 def available() -> tuple[str, ...]:
@@ -22,6 +29,7 @@ def load(name: str = "open") -> HeadModel:
 
     Raises:
         InputError: no such model.
+        AssetError: it is one that users add themselves, and it has not been added.
     """
     if name not in _LOADERS:
         raise InputError(f"there is no head model {name!r}, known are {', '.join(_LOADERS)}", "use 'open'")

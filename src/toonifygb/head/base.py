@@ -91,6 +91,9 @@ class HeadModel(TensorRecord):
     uv: Float[Tensor, "f 3 2"] | None = None
     """Texture coordinates of each face's corners, 0..1, v up; NaN where a part has none."""
     parents: tuple[int, ...] = PARENTS
+    n_blendshapes: int | None = None
+    """How many of the expression coefficients, from the first on, Gaussians get blendshapes for where no setting
+    says so; all when ``None``."""
 
     @property
     def n_vertices(self) -> int:

@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from toonifygb import avatar as avatars
-from toonifygb import face, head, stylize, track, train, video
+from toonifygb import datasets, face, head, stylize, track, train, video
 from toonifygb.config import from_json, to_json
 from toonifygb.errors import FaceError, InputError
+from toonifygb.pipeline import imported
 from toonifygb.pipeline.files import LANDMARK_TRACK, load_landmarks, open_crops, save_landmarks
 from toonifygb.pipeline.outcome import outcome
 from toonifygb.pipeline.segments import SEGMENT, Segments
@@ -45,6 +46,7 @@ def create(source: Source, run: Run, config: RunConfig) -> None:
         Stopped: the user asked to stop; calling again goes on.
     """
     check_size(config)
+    imported.check_style(source, config)
     remember_request(source, run, config)
     fitted, styled = track_stages(source, run, config)
     check_trainable(run, source)
@@ -68,6 +70,25 @@ def check_size(config: RunConfig) -> None:
         )
 
 
+def import_only(source: Source, run: Run, config: RunConfig) -> None:
+    """Runs the stages up to the training set of a dataset of other people; ``train RUN`` goes on from there.
+
+    Raises:
+        InputError: the source is no such dataset, or something of it is missing.
+    """
+    if source.foreign is None:
+        raise InputError(
+            f"{source.path} is no dataset of a kind that can be read ({', '.join(datasets.LAYOUTS)})",
+            "give the folder that holds images and checkpoint, or use toonifygb create for a clip",
+        )
+    imported.check_style(source, config)
+    remember_request(source, run, config)
+    fitted, styled = track_stages(source, run, config)
+    cut = cut_dataset(source, run, config, fitted, styled)
+    tracked = finish_track(run, config, fitted, cut)
+    draw_overlay(source, run, tracked, styled)
+
+
 def track_only(source: Source, run: Run, config: RunConfig) -> None:
     """Runs the stages up to the track and its overlay; the pixels are left out, as they need an avatar."""
     remember_request(source, run, config)
@@ -80,6 +101,8 @@ def track_stages(source: Source, run: Run, config: RunConfig) -> tuple[str, str]
     """Fingerprints of the landmark track and of the stylised video it stands beside."""
     found = find_landmarks(source, run, config)
     styled = stylize_clip(source, run, config, found)
+    if source.foreign is not None:
+        return imported.take_track(source, run, config, found), styled
     chosen = choose_landmarks(run, config, found, styled)
     return fit_track(source, run, config, chosen), styled
 
@@ -112,13 +135,18 @@ def find_landmarks(source: Source, run: Run, config: RunConfig) -> str:
     path = run.work("landmarks.safetensors")
 
     def work(progress: Progress) -> None:
-        clip = video.open_clip(source.path)
-        frames = itertools.islice(clip, config.max_frames)
-        landmarks, report = face.find_landmarks(
-            frames, config.face, n_frames=source.n_frames(config), progress=progress
-        )
-        run.problems("video", list(clip.problems))
-        run.problems("face", list(report.problems))
+        frames, problems = source.clip(config)
+        try:
+            landmarks, report = face.find_landmarks(
+                frames, config.face, n_frames=source.n_frames(config), progress=progress
+            )
+            sentences = list(report.problems)
+        except FaceError as error:
+            if source.foreign is None:
+                raise
+            landmarks, sentences = imported.unseen_landmarks(source, config), [error.message]
+        run.problems("video", list(problems))
+        run.problems("face", sentences)
         save_landmarks(landmarks, path)
 
     return run.stage(
@@ -214,7 +242,7 @@ def fit_track(source: Source, run: Run, config: RunConfig, chosen: str) -> str:
     def work(progress: Progress) -> None:
         sequence = track.fit(
             load_landmarks(run.work("landmarks_chosen.safetensors")),
-            head.load("open"),
+            head.load(config.head),
             config.track,
             fps=source.info.fps,
             source_sha256=source.sha256,
@@ -223,7 +251,7 @@ def fit_track(source: Source, run: Run, config: RunConfig, chosen: str) -> str:
         run.problems("track", list(track.report(sequence).problems))
         track.save(sequence, out)
 
-    settings = {"n_shape": config.track.n_shape, "iterations": config.track.iterations}
+    settings = {"head": config.head, "n_shape": config.track.n_shape, "iterations": config.track.iterations}
     return run.stage("track", "tracking the head", inputs=[chosen, settings], outputs=[out], work=work)
 
 
@@ -238,7 +266,7 @@ def finish_track(run: Run, config: RunConfig, fitted: str, cut: str | None) -> s
             sequence = train.refine_track(
                 open_crops(run, sequence),
                 sequence,
-                head.load("open"),
+                head.load(sequence.head_model),
                 seed=config.train.seed,
                 backend=config.backend,
                 threads=config.threads,
@@ -256,7 +284,7 @@ def draw_overlay(source: Source, run: Run, tracked: str, styled: str) -> None:
 
     def work(progress: Progress) -> None:
         info, sequence = source.info, track.load(run.file("track.safetensors"))
-        draw = track.Overlay(sequence, head.load("open"))
+        draw = track.Overlay(sequence, head.load(sequence.head_model))
         films = video.read(run.file("stylized.mp4"), max_frames=sequence.n_frames)
         with video.Writer(out, info.width, info.height, info.fps, audio_from=source.path) as writer:
             for index, frame in enumerate(films):
@@ -283,20 +311,24 @@ def check_trainable(run: Run, source: Source) -> None:
 
 def cut_dataset(source: Source, run: Run, config: RunConfig, fitted: str, styled: str) -> str:
     """The square head crops and mattes that Stage 2 is trained on."""
-    out = run.work("dataset")
+    out, training = run.work("dataset"), imported.train_config(source, config)
 
     def work(progress: Progress) -> None:
         sequence = track.load(run.work(LANDMARK_TRACK))
-        model = head.load("open")
+        model = head.load(sequence.head_model)
+        if imported.own_mattes(source):
+            pairs = imported.head_pictures(source, run, config)
+            train.build_dataset(pairs, sequence, model, training, out, progress=progress)
+            return
         frames = (f[: source.info.height, : source.info.width] for f in video.read(run.file("stylized.mp4")))
         landmarks = load_landmarks(run.work("landmarks.safetensors"))
         stylizer = open_style(config)
         photos = stylize.warp_frames(source.frames(config), landmarks, stylizer, config.stylize.strength)
         pairs = head_frames(photos, frames, sequence, model)
-        train.build_dataset(pairs, sequence, model, config.train, out, progress=progress)
+        train.build_dataset(pairs, sequence, model, training, out, progress=progress)
 
     keys = ("resolution", "crop_scale", "test_share", "max_test_frames")
-    settings = {key: getattr(config.train, key) for key in keys}
+    settings = {key: getattr(training, key) for key in keys}
     return run.stage(
         "dataset",
         "cutting out the head",
@@ -348,7 +380,7 @@ def train_avatar(run: Run, config: RunConfig, cut: str, tracked: str) -> str:
         trained = train.train(
             open_crops(run, sequence),
             sequence,
-            head.load("open"),
+            head.load(sequence.head_model),
             config.train,
             run.work("training"),
             backend=config.backend,

@@ -24,7 +24,11 @@ LANDMARK_TRACK = "landmark_track.safetensors"
 
 
 def open_crops(run: Run, sequence: TrackedSequence) -> train.Dataset:
-    """The run's training set, with the necks ending where a track of its clip has them end."""
+    """The run's training set, with the necks ending where a track of its clip has them end; where the mattes are a
+    dataset's own, they end where it says.
+    """
+    if run.state.get("track_on", {}).get("own_mattes"):
+        return train.load_dataset(run.work("dataset"))
     cuts = track.neck_cuts(sequence, head.load(sequence.head_model))
     return train.load_dataset(run.work("dataset")).cut_at(cuts)
 

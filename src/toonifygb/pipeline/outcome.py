@@ -69,7 +69,7 @@ def score(source: Source, run: Run, config: RunConfig, trained: str) -> str:
         driven = train.evaluate(model, dataset, by_landmarks, dataset.split.test, **engine)
         held_out |= {f"{name}_landmark_pose": driven[name] for name in ("psnr", "ssim")}
         refined_error = track.landmark_errors(sequence, head.load(sequence.head_model))
-        held_out["landmark_error_refined_px"] = float(refined_error[sequence.tracked].mean())
+        held_out["landmark_error_refined_px"] = _mean(refined_error[sequence.error_px.isfinite()])
         styled = run.file("stylized.mp4")
         steadiness = metrics.stability(video.read(styled))
         with closing(source.frames(config)) as filmed:
@@ -78,6 +78,12 @@ def score(source: Source, run: Run, config: RunConfig, trained: str) -> str:
         write_json(out, {**held_out, **steady})
 
     return run.stage("scores", "judging on held-out frames", inputs=[trained], outputs=[out], work=work)
+
+
+def _mean(values: torch.Tensor) -> float | None:
+    """Mean of the finite values; ``None`` where there are none, as JSON has no NaN."""
+    values = values[values.isfinite()]
+    return float(values.mean()) if len(values) else None
 
 
 def _cropped(frames: Iterator[np.ndarray], source: Source) -> Iterator[np.ndarray]:
@@ -172,7 +178,7 @@ def metrics_record(source: Source, run: Run, config: RunConfig, scores: dict[str
         "n_test": len(dataset.split.test),
         "resolution": dataset.size,
         "n_gaussians": model.n,
-        "landmark_error_px": float(errors.mean()),
+        "landmark_error_px": _mean(errors),
         "track_on": run.state["track_on"]["choice"],
         "seconds": run.seconds(),
         "peak_memory_mb": max([peak_memory_mb(), *(entry["peak_memory_mb"] for entry in stages.values())]),
@@ -205,13 +211,23 @@ def report_pictures(run: Run, config: RunConfig) -> dict[str, np.ndarray]:
         )
     viewer.look_through(dataset.camera(dataset.split.train[len(dataset.split.train) // 2]))
     views = viewer.frames(middle, [(yaw, 0.0) for yaw in _VIEWS_DEG])
-    faces = [viewer.frame(posed(model, weights)) for _, weights in _EXPRESSIONS]
+    shown = expressions(model)
+    faces = [viewer.frame(posed(model, weights)) for _, weights in shown]
     return {
         "1-held-out": pictures.stack(held_out),
         "2-views": pictures.row(views, [f"{yaw:+.0f} deg" for yaw in _VIEWS_DEG], 240),
-        "3-expressions": pictures.row(faces, [name for name, _ in _EXPRESSIONS], 200),
+        "3-expressions": pictures.row(faces, [name for name, _ in shown], 200),
         "4-tracking": overlay_sheet(run, sequence),
     }
+
+
+def expressions(model: avatars.Avatar) -> list[tuple[str, dict[str, float]]]:
+    """Expressions for the report: known faces by name, and, of a head model without such names, its first units."""
+    known = {"jawOpen", "eyesClosed", *model.blendshape_names[: model.n_expressions]}
+    if all(weights.keys() <= known for _, weights in _EXPRESSIONS):
+        return list(_EXPRESSIONS)
+    named = [entry for entry in _EXPRESSIONS if entry[1].keys() <= known]
+    return named + [(name, {name: 2.0}) for name in model.blendshape_names[: len(_EXPRESSIONS) - len(named)]]
 
 
 def overlay_sheet(run: Run, sequence: TrackedSequence) -> np.ndarray:
@@ -232,11 +248,11 @@ _CAPTIONS = {
 def report_page(source: Source, run: Run, config: RunConfig, values: dict[str, Any]) -> Report:
     """The report's record from the run's files and figures."""
     sheet = run.work("pictures")
-    seconds = list(values["seconds"].items())
+    seconds, error = list(values["seconds"].items()), values["landmark_error_px"]
     tiles = [
         ("PSNR, held out", f"{values['psnr']:.2f} dB"),
         ("SSIM, held out", f"{values['ssim']:.4f}"),
-        ("landmark error", f"{values['landmark_error_px']:.2f} px"),
+        ("landmark error", "no face found" if error is None else f"{error:.2f} px"),
         ("Gaussians", f"{values['n_gaussians']:,}"),
         ("steadiness (ITF)", f"{values['itf']:.1f} dB"),
         ("time", f"{sum(s for _, s in seconds) / 60:.1f} min"),

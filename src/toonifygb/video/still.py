@@ -47,14 +47,35 @@ def load_image(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def save_png(path: str | os.PathLike[str], image: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Writes an RGB image as PNG; the file appears only when it is complete.
+def load_rgba(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 4"]:
+    """An image file as it is stored, 8-bit RGB with straight alpha; opaque where it has none, grey repeated.
+
+    Raises:
+        InputError: no such file, or not an image.
+    """
+    path = Path(path)
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise InputError(f"image {path} cannot be read: {error.strerror}", "check the path") from error
+    stored = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    if stored is None or stored.dtype.name not in _ALPHA_STEPS:
+        raise InputError(f"{path} is not an image that can be read", f"use one of {', '.join(IMAGE_SUFFIXES)}")
+    image = (stored // _ALPHA_STEPS[stored.dtype.name]).astype(np.uint8)
+    if image.ndim == 2:
+        return cv2.cvtColor(image, cv2.COLOR_GRAY2RGBA)
+    return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGBA)
+
+
+def save_png(path: str | os.PathLike[str], image: UInt8[np.ndarray, "h w c"]) -> None:
+    """Writes an RGB image, or one with straight alpha, as PNG; the file appears only when it is complete.
 
     Raises:
         InputError: the place cannot be written to.
     """
     path = Path(path)
-    _, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    order = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
+    _, data = cv2.imencode(".png", cv2.cvtColor(image, order))
     try:
         with replacing(path) as temporary:
             temporary.write_bytes(data.tobytes())
