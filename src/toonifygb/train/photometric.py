@@ -100,8 +100,9 @@ def refine_track(
             full_camera=small.full_camera,
             views=TrainingViews(small, sequence, head),
         )
-        state = TrainState.start(avatar, seed)
-        stepper = Stepper(state, avatar, small, sequence, config, renderer, render.kernels(backend, threads))
+        kernels = render.kernels(backend, threads)
+        state = TrainState.start(avatar, seed).to(kernels.device)
+        stepper = Stepper(state, avatar, small, sequence, config, renderer, kernels)
         rigid = _above_chin(state, sequence, head)
         twists = torch.zeros(sequence.n_frames, 6)
         while state.step < STEPS:
@@ -182,7 +183,7 @@ class _Poses:
 def _above_chin(state: TrainState, sequence: TrackedSequence, head: HeadModel) -> Bool[Tensor, " n"]:
     """Which Gaussians turn with the skull: those of the neck stay with the shoulders and would hold it back."""
     chin = head.landmarks().subset(torch.tensor([CHIN])).rest(sequence.shape)[0, 1]
-    return state.neutral.values.means[:, 1] > chin
+    return state.neutral.values.means[:, 1].cpu() > chin
 
 
 def _newton(

@@ -36,7 +36,7 @@ class Stepper:
     """Takes steps of a training; everything that does not change from step to step is prepared here.
 
     Args:
-        state: changed in place by ``step``.
+        state: changed in place by ``step``; its tensors are where the kernels want them.
         template: the avatar's unchanging parts.
         dataset: crops, mattes, cameras, split.
         sequence: motion of every frame.
@@ -63,16 +63,17 @@ class Stepper:
         self._kernels = kernels
         self._weights = LossWeights.of(config)
         self._template = template
-        self._mouth = MouthVolume.around(join([template.mouth_upper, template.mouth_lower]).means)
+        mouth = MouthVolume.around(join([template.mouth_upper, template.mouth_lower]).means)
+        self._mouth = mouth.to(kernels.device)
         self.follow(sequence)
         self.rebind()
 
     def follow(self, sequence: TrackedSequence) -> None:
         """Takes the motion of every frame from a track."""
-        template = self._template
-        self._transforms = template.transforms(sequence.motion)
-        self._features = template.pose_feature(sequence.motion)
-        psi = template.coefficients(sequence.motion)
+        template, device = self._template, self._kernels.device
+        self._transforms = template.transforms(sequence.motion).to(device)
+        self._features = template.pose_feature(sequence.motion).to(device)
+        psi = template.coefficients(sequence.motion).to(device)
         n_expression = template.n_expressions + template.n_eyelids
         self._expression = psi[:, :n_expression].contiguous()
         self._driver = psi[:, n_expression:].contiguous()
@@ -96,8 +97,8 @@ class Stepper:
         return terms
 
     def splats(self, index: int) -> Splats:
-        """All Gaussians as they stand now, in the pose of one frame, world space."""
-        return self._posed(index)[1]
+        """All Gaussians as they stand now, in the pose of one frame, world space; on the processor."""
+        return self._posed(index)[1].to("cpu")
 
     def _coefficients(self, index: int) -> Coefficients:
         return Coefficients(self._expression[index], self._driver[index])
@@ -115,7 +116,7 @@ class Stepper:
         cut_off = Splats(*leaves, sh_frames=splats.sh_frames)
         camera = self._dataset.camera(index)
         rendering = self._renderer.render(cut_off, camera, sh_degree=self.sh_degree, info=info)
-        target, matte = self._dataset.target(index)
+        target, matte = self._dataset.target(index, self._kernels.device)
         photo, alpha, v_color, v_alpha = image_gradients(rendering, target, matte, self._weights, self._kernels)
         found = torch.autograd.grad([rendering.color, rendering.alpha], leaves, [v_color, v_alpha])
         binding = (self.state.skin_weights, self._transforms[index])
