@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from toonifygb.geometry.rotations import quat_multiply, quat_normalize
 from toonifygb.metrics.similarity import SSIM_C1, SSIM_C2, ssim_window
 from toonifygb.render import cuda
 from toonifygb.render.fused import BETA1, BETA2, EPS, ReferenceKernels, check_blend_step
+from toonifygb.structures import GaussianParams, Splats
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
 
 BLOCK = 1024
 """Floats that one program of an elementwise kernel works on."""
+SKIN_BLOCK = 128
+"""Gaussians that one program skins."""
 
 
 class CudaKernels(ReferenceKernels):
@@ -118,6 +122,51 @@ class CudaKernels(ReferenceKernels):
                     BLOCK=BLOCK,
                 )
             start += count
+
+    def skin(
+        self, raw: GaussianParams, weights: Float[Tensor, "n 5"], transforms: Float[Tensor, "5 4 4"]
+    ) -> Splats:
+        """See ``Kernels.skin``."""
+        linear, shift, rotation, turn = self._skin_maps(weights, transforms)
+        return Splats(
+            means=(linear * raw.means[:, None, :]).sum(-1) + shift,
+            quats=quat_multiply(turn, quat_normalize(raw.quats)),
+            scales=raw.log_scales.exp(),
+            opacities=raw.opacity_logits.sigmoid(),
+            sh=raw.sh,
+            sh_frames=rotation,
+        )
+
+    def skin_gradient(
+        self,
+        raw: GaussianParams,
+        weights: Float[Tensor, "n 5"],
+        transforms: Float[Tensor, "5 4 4"],
+        gradient: Splats,
+    ) -> GaussianParams:
+        """See ``Kernels.skin_gradient``: products with a constant are undone by its transpose or conjugate."""
+        linear, _, _, turn = self._skin_maps(weights, transforms)
+        length = raw.quats.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+        unit = raw.quats / length
+        pull = quat_multiply(turn * turn.new_tensor([1.0, -1.0, -1.0, -1.0]), gradient.quats)
+        opacities = raw.opacity_logits.sigmoid()
+        return GaussianParams(
+            means=(linear * gradient.means[:, :, None]).sum(1),
+            quats=(pull - unit * (unit * pull).sum(-1, keepdim=True)) / length,
+            log_scales=gradient.scales * raw.log_scales.exp(),
+            opacity_logits=gradient.opacities * opacities * (1 - opacities),
+            sh=gradient.sh,
+        )
+
+    def _skin_maps(self, weights: Tensor, transforms: Tensor) -> list[Tensor]:
+        """Each Gaussian's linear map, translation, rotation factor, and that as a quaternion."""
+        n, joints = weights.shape
+        maps = [weights.new_empty(n, *shape) for shape in ((3, 3), (3,), (3, 3), (4,))]
+        if n:
+            grid = (-(-n // SKIN_BLOCK),)
+            inputs = (weights.contiguous(), transforms.contiguous())
+            cuda.triton_kernels().skin_maps[grid](*inputs, *maps, n, JOINTS=joints, BLOCK=SKIN_BLOCK)
+        return maps
 
     def l1_dssim(
         self,

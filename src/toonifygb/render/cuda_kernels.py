@@ -293,3 +293,98 @@ def smooth(images, window, out, n, length, stride, TAPS: tl.constexpr, BLOCK: tl
         inside = (place < n) & (along + reach >= 0) & (along + reach < length)
         total += tl.load(window + tap) * tl.load(images + place + reach * stride, mask=inside, other=0.0)
     tl.store(out + place, total, mask=place < n)
+
+
+@triton.jit
+def _inverse_transpose(a, b, c, d, e, f, g, h, i):
+    """M⁻ᵀ of the matrix with rows abc, def, ghi: cofactors over determinant."""
+    A, B, C = e * i - f * h, f * g - d * i, d * h - e * g
+    D, E, F = h * c - i * b, i * a - g * c, g * b - h * a
+    G, H, I = b * f - c * e, c * d - a * f, a * e - b * d  # noqa: E741
+    r = 1.0 / (a * A + b * B + c * C)
+    return A * r, B * r, C * r, D * r, E * r, F * r, G * r, H * r, I * r
+
+
+@triton.jit
+def _quaternion(a, b, c, d, e, f, g, h, i):
+    """Unit quaternion of the rotation with rows abc, def, ghi, its largest component positive."""
+    ww, xx, yy, zz = 1.0 + a + e + i, 1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i
+    wx, wy, wz = h - f, c - g, d - b
+    xy, xz, yz = d + b, c + g, h + f
+    # The first of the largest wins, as with argmax.
+    is_w = (ww >= xx) & (ww >= yy) & (ww >= zz)
+    is_x = (xx >= yy) & (xx >= zz)
+    is_y = yy >= zz
+    w = tl.where(is_w, ww, tl.where(is_x, wx, tl.where(is_y, wy, wz)))
+    x = tl.where(is_w, wx, tl.where(is_x, xx, tl.where(is_y, xy, xz)))
+    y = tl.where(is_w, wy, tl.where(is_x, xy, tl.where(is_y, yy, yz)))
+    z = tl.where(is_w, wz, tl.where(is_x, xz, tl.where(is_y, yz, zz)))
+    largest = tl.where(is_w, ww, tl.where(is_x, xx, tl.where(is_y, yy, zz)))
+    r = 0.5 / tl.sqrt_rn(largest)
+    return w * r, x * r, y * r, z * r
+
+
+@triton.jit
+def skin_maps(weights, transforms, linear, shift, rotation, turn, n, JOINTS: tl.constexpr, BLOCK: tl.constexpr):
+    """Blended joint maps and their rotation factors, three Newton steps of the polar decomposition.
+
+    Args:
+        weights: rows of ``JOINTS`` shares.
+        transforms: ``JOINTS`` matrices 4×4.
+        linear: 3×3 part of each Gaussian's map, out.
+        shift: its translation, out.
+        rotation: its rotation factor, out.
+        turn: that as a quaternion, out.
+        n: Gaussians.
+        JOINTS: number of joints.
+        BLOCK: Gaussians at once.
+    """
+    place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = place < n
+    zero = tl.zeros((BLOCK,), tl.float32)
+    a, b, c, d, e, f, g, h, i = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    x, y, z = zero, zero, zero
+    for joint in tl.static_range(JOINTS):
+        share = tl.load(weights + place * JOINTS + joint, mask=inside, other=0.0)
+        matrix = transforms + joint * 16
+        a += share * tl.load(matrix)
+        b += share * tl.load(matrix + 1)
+        c += share * tl.load(matrix + 2)
+        x += share * tl.load(matrix + 3)
+        d += share * tl.load(matrix + 4)
+        e += share * tl.load(matrix + 5)
+        f += share * tl.load(matrix + 6)
+        y += share * tl.load(matrix + 7)
+        g += share * tl.load(matrix + 8)
+        h += share * tl.load(matrix + 9)
+        i += share * tl.load(matrix + 10)
+        z += share * tl.load(matrix + 11)
+    _store9(linear + place * 9, a, b, c, d, e, f, g, h, i, inside)
+    tl.store(shift + place * 3, x, mask=inside)
+    tl.store(shift + place * 3 + 1, y, mask=inside)
+    tl.store(shift + place * 3 + 2, z, mask=inside)
+    for _step in tl.static_range(3):
+        A, B, C, D, E, F, G, H, I = _inverse_transpose(a, b, c, d, e, f, g, h, i)  # noqa: E741
+        a, b, c = 0.5 * (a + A), 0.5 * (b + B), 0.5 * (c + C)
+        d, e, f = 0.5 * (d + D), 0.5 * (e + E), 0.5 * (f + F)
+        g, h, i = 0.5 * (g + G), 0.5 * (h + H), 0.5 * (i + I)
+    _store9(rotation + place * 9, a, b, c, d, e, f, g, h, i, inside)
+    qw, qx, qy, qz = _quaternion(a, b, c, d, e, f, g, h, i)
+    tl.store(turn + place * 4, qw, mask=inside)
+    tl.store(turn + place * 4 + 1, qx, mask=inside)
+    tl.store(turn + place * 4 + 2, qy, mask=inside)
+    tl.store(turn + place * 4 + 3, qz, mask=inside)
+
+
+@triton.jit
+def _store9(matrix, a, b, c, d, e, f, g, h, i, inside):
+    """Writes a 3×3 matrix row by row."""
+    tl.store(matrix, a, mask=inside)
+    tl.store(matrix + 1, b, mask=inside)
+    tl.store(matrix + 2, c, mask=inside)
+    tl.store(matrix + 3, d, mask=inside)
+    tl.store(matrix + 4, e, mask=inside)
+    tl.store(matrix + 5, f, mask=inside)
+    tl.store(matrix + 6, g, mask=inside)
+    tl.store(matrix + 7, h, mask=inside)
+    tl.store(matrix + 8, i, mask=inside)
