@@ -90,7 +90,7 @@ def matmul_rate(bench: Bench, precision: str) -> float:
 
 
 def build_native() -> str | None:
-    """Builds the native engine where it is missing, for drawing synthetic frames; why it could not, else ``None``."""
+    """Builds the native engine where it is missing, to draw synthetic frames; why it could not, else ``None``."""
     from toonifygb.render import library
 
     if library.unavailable() is None:

@@ -88,7 +88,7 @@ def avatar(n_face: int, n_mouth: int, degree: int, size: int) -> Avatar:
 
     deltas = first.deltas.map(repeated(1))
     for _, delta in each(deltas):
-        delta += 1e-3 * torch.randn(delta.shape, generator=random)
+        delta.add_(torch.randn(delta.shape, generator=random), alpha=1e-3)
     return replace(
         first,
         neutral=spread(first.neutral),

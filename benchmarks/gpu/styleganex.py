@@ -1,4 +1,4 @@
-"""StyleGANEX frames per second for 512 × 512 inputs: fp32, tf32, bf16, compiled; to 4 times the size and to the same.
+"""StyleGANEX frames per second for 512 px inputs: fp32, tf32, bf16, compiled; to 4 times the size, to the same.
 
 Weights come from a seeded generator of the right layout; the arithmetic does not depend on what they are.
 """
