@@ -7,8 +7,10 @@ conventions are tested everywhere.
 from __future__ import annotations
 
 import logging
+import os
 import sys
 import types
+from importlib.util import find_spec
 from typing import Any
 
 import pytest
@@ -135,6 +137,55 @@ def test_l1_dssim(cuda_kernels: Kernels, size: tuple[int, int]) -> None:
     expected, slope = DEFINITION.l1_dssim(image.double(), target.double(), 0.7, 0.4)
     assert loss.item() == pytest.approx(expected.item(), abs=1e-6)
     torch.testing.assert_close(gradient.double(), slope, rtol=0, atol=2e-6 * slope.abs().max().item())
+
+
+def _signature(kernel: Any, constants: dict[str, Any]) -> dict[str, str]:
+    """Types of a kernel's arguments as the launches give them."""
+    integers, numbers = (
+        {"starts", "slots", "stops"},
+        {"width", "height", "tiles_x", "k", "p", "start", "count", "n"},
+    )
+    numbers |= {"per_gaussian", "length", "stride"}
+    floats = {"alpha_min", "alpha_max", "transmittance_min", "factor", "eps", "first_gain", "second_gain"}
+    types = {}
+    for name in kernel.arg_names:
+        known = {"constexpr": constants, "*i32": integers, "i32": numbers, "fp32": floats}
+        types[name] = next((kind for kind, names in known.items() if name in names), "*fp32")
+    return types
+
+
+@pytest.mark.skipif(find_spec("triton") is None, reason="Triton is not installed")
+@pytest.mark.skipif(os.environ.get(cuda.INTERPRET_VARIABLE) == "1", reason="the kernels are interpreted")
+@pytest.mark.parametrize("capability", [80, 90])
+def test_kernels_compile_without_a_gpu(capability: int) -> None:
+    import triton
+    from triton.backends.compiler import GPUTarget
+
+    from toonifygb.render import cuda_kernels
+
+    strip = {"FIELDS": cuda.FIELDS, "TILE": 16, "ROWS": 4, "PIXELS": 64}
+    betas = {"BETA1": 0.9, "BETA2": 0.999, "BLOCK": 1024}
+    jobs = [
+        ("composite_forward", strip),
+        ("composite_forward", strip | {"width": 1, "height": 1, "tiles_x": 1}),  # Triton makes ones constants
+        ("composite_backward", strip | {"COLUMNS": cuda.COLUMNS}),
+        ("composite_backward", strip | {"COLUMNS": cuda.COLUMNS, "width": 1, "height": 1, "tiles_x": 1}),
+        ("sum_rows", {"COLUMNS": cuda.COLUMNS, "WIDE": 16, "BLOCK": cuda.SUM_ROWS}),
+        ("blend", {"BLOCK": 1024}),
+        ("blend", {"BLOCK": 1024, "k": 1, "p": 1}),
+        ("adam", betas | {"SCALED": True, "SKIP": True, "per_gaussian": 1, "n": 1}),
+        ("adam", betas | {"SCALED": False, "SKIP": False, "p": 1, "count": 1}),
+        ("smooth", {"TAPS": 11, "BLOCK": 1024}),
+        ("smooth", {"TAPS": 11, "BLOCK": 1024, "length": 1, "stride": 1}),
+        ("skin_maps", {"JOINTS": 5, "BLOCK": 128}),
+        ("skin_maps", {"JOINTS": 5, "BLOCK": 128, "n": 1}),
+    ]
+    for name, constants in jobs:
+        kernel = getattr(cuda_kernels, name)
+        source = triton.compiler.ASTSource(fn=kernel, signature=_signature(kernel, constants), constexprs=constants)
+        warps = 1 if name.startswith(("composite", "sum")) else 4
+        compiled = triton.compile(source, target=GPUTarget("cuda", capability, 32), options={"num_warps": warps})
+        assert compiled.asm["cubin"], name
 
 
 def test_unusable_tensors_are_named(cuda_kernels: Kernels) -> None:
