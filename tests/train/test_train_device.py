@@ -114,7 +114,7 @@ def test_training_is_the_same_there(
 ) -> None:
     dataset, sequence = clip
     monkeypatch.setattr("toonifygb.train.loop.Densifier", _eager_densifier)
-    config = replace(TINY, n_gaussians=60, n_mouth_gaussians=12, resolution=32, steps=8, densify=True)
+    config = replace(TINY, n_gaussians=60, n_mouth_gaussians=12, resolution=32, steps=5, densify=True)
     config = replace(config, checkpoint_seconds=0.0)  # one after every step
     trained = []
     for name in ("reference", "cuda"):
