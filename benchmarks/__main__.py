@@ -9,7 +9,7 @@ import sys
 import benchmarks
 from benchmarks import harness
 
-SUPPORT = {"__main__", "harness", "scenes", "limits"}
+SUPPORT = {"__main__", "harness", "scenes", "limits", "gpu"}
 
 
 def main(arguments: list[str]) -> int:

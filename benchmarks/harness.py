@@ -84,23 +84,25 @@ def commit() -> str:
     return done.stdout.strip() or "unknown"
 
 
-def record(name: str, figures: list[Figure]) -> None:
-    """Appends one JSON line per figure to ``benchmarks/results/NAME.jsonl``."""
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    with (RESULTS / f"{name}.jsonl").open("a", encoding="utf-8") as lines:
+def record(name: str, figures: list[Figure], folder: Path = RESULTS, **facts: str) -> None:
+    """Appends one JSON line per figure to ``NAME.jsonl``; ``facts`` replace this machine's name and commit."""
+    folder.mkdir(parents=True, exist_ok=True)
+    facts = facts or {"machine": machine(), "commit": commit()}
+    with (folder / f"{name}.jsonl").open("a", encoding="utf-8") as lines:
         for figure in figures:
-            row = {**asdict(figure), "ratio": figure.ratio, "machine": machine(), "commit": commit()}
+            row = {**asdict(figure), "ratio": figure.ratio, **facts}
             lines.write(json.dumps(row) + "\n")
 
 
-def show(name: str, figures: list[Figure]) -> None:
-    """Prints the figures as a small table."""
+def show(name: str, figures: list[Figure], **facts: str) -> None:
+    """Prints the figures as a small table; ``facts`` as in ``record``."""
 
     def cell(value: float | None) -> str:
         return "" if value is None else f"{value:.3g}"
 
     width = max(len(figure.claim) for figure in figures)
-    print(f"\n{name} — {machine()}, commit {commit()}")
+    facts = facts or {"machine": machine(), "commit": commit()}
+    print(f"\n{name} — {facts['machine']}, commit {facts['commit']}")
     print(f"{'':{width}}  {'figure':>10} {'unit':<8} {'baseline':>9} {'ratio':>7} {'floor':>7}")
     for figure in figures:
         numbers = f"{cell(figure.figure):>10} {figure.unit:<8} {cell(figure.baseline):>9}"

@@ -154,7 +154,7 @@ class RunConfig:
     max_frames: int | None = None
     """Use only the first frames of the clip."""
     backend: str = "auto"
-    """Rasteriser: auto, native or reference."""
+    """Rasteriser: auto, cuda, gsplat, native or reference."""
     threads: int | None = None
     """Threads of the native engine; all cores when unset."""
 

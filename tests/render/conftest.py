@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import pytest
 
 from toonifygb import render
-from toonifygb.render import library
+from toonifygb.render import cuda, library
 
-BACKENDS = ("reference", "native")
+if TYPE_CHECKING:
+    from toonifygb.render.fused import Kernels
+
+BACKENDS = ("reference", "native", "cuda")
 
 
 def _require(backend: str) -> None:
     if backend == "native" and (reason := library.unavailable()):
         pytest.skip(f"native engine not available: {reason}")
+    if backend == "cuda" and (reason := cuda.unavailable()):
+        pytest.skip(f"CUDA renderer not available: {reason}")
 
 
 @pytest.fixture(params=BACKENDS)
@@ -34,3 +41,10 @@ def native_kernels() -> object:
     """The native training kernels, on one thread."""
     _require("native")
     return render.kernels("native", threads=1)
+
+
+@pytest.fixture
+def cuda_kernels() -> Kernels:
+    """The training kernels on the CUDA device, or in Triton's interpreter."""
+    _require("cuda")
+    return render.kernels("cuda")

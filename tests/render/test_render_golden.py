@@ -49,7 +49,7 @@ def scene_of(arrays: Arrays, dtype: torch.dtype) -> tuple[Splats, Camera]:
 
 def dtypes(renderer: render.Renderer) -> list[torch.dtype]:
     """Precisions to test a renderer in."""
-    return [torch.float32] if renderer.name == "native" else [torch.float64, torch.float32]
+    return [torch.float64, torch.float32] if renderer.name == "reference" else [torch.float32]
 
 
 def worst(found: torch.Tensor, expected: np.ndarray, arrays: Arrays) -> float:

@@ -147,8 +147,9 @@ def test_the_instruction_set_can_be_forced() -> None:
 
 
 def test_unknown_backends_are_refused() -> None:
-    with pytest.raises(InputError, match="backend is 'cuda', expected one of auto, native, reference"):
-        render.get("cuda")
+    names = "auto, cuda, gsplat, native, reference"
+    with pytest.raises(InputError, match=f"backend is 'vulkan', expected one of {names}"):
+        render.get("vulkan")
 
 
 def test_auto_says_what_it_chose(native: render.Renderer, caplog: pytest.LogCaptureFixture) -> None:

@@ -24,7 +24,7 @@ class Poser:
 
     Args:
         avatar: float32, on the CPU.
-        backend: of the kernels: ``auto``, ``native`` or ``reference``.
+        backend: of the kernels, see ``render.get``; the splats come out on their device.
         threads: of the native engine.
         half: keep the deltas as bfloat16: half the memory traffic, which is what blending costs.
     """
@@ -34,26 +34,31 @@ class Poser:
     ) -> None:
         self._avatar = avatar
         self._kernels = render.kernels(backend, threads)
-        self._neutral = join([avatar.neutral, avatar.mouth_upper, avatar.mouth_lower])
+        device = self._kernels.device
+        self._neutral = join([avatar.neutral, avatar.mouth_upper, avatar.mouth_lower]).to(device)
+        self._pose_basis = avatar.pose_basis.to(device)
         weights = [avatar.skin_weights]
         weights.append(avatar.mouth_upper_weights.expand(avatar.mouth_upper.n, -1))
         weights.append(avatar.mouth_lower_weights.expand(avatar.mouth_lower.n, -1))
-        self._weights = torch.cat(weights)
+        self._weights = torch.cat(weights).to(device)
         self._n_expression = avatar.n_expressions + avatar.n_eyelids
         dtype = torch.bfloat16 if half else torch.float32
         expression = cut(avatar.deltas, 0, self._n_expression)
         driver = avatar.deltas.map(lambda delta: delta[self._n_expression :])
         groups = [cut_deltas(group, 0, last_changed(group)) for group in (expression, driver)]
-        self._groups = [group.map(lambda delta: delta.to(dtype).contiguous()) for group in groups]
+        self._groups = [group.map(lambda delta: delta.to(device, dtype).contiguous()) for group in groups]
 
     def __call__(self, motion: HeadMotion) -> Splats:
         """Splats in the world for one frame's motion, as ``Avatar.pose`` gives them; without gradients."""
+        avatar, device = self._avatar, self._kernels.device
         with torch.no_grad():
-            psi = self._avatar.coefficients(motion)
+            # A few dozen numbers: the processor has them before a device would have started.
+            psi = avatar.coefficients(motion).to(device)
+            feature, transforms = avatar.pose_feature(motion).to(device), avatar.transforms(motion).to(device)
             raw = self._blend([psi[: self._n_expression].contiguous(), psi[self._n_expression :].contiguous()])
-            face = raw.means[: self._avatar.neutral.n]
-            face += pose_offsets(self._avatar.pose_feature(motion), self._avatar.pose_basis)
-            return self._kernels.skin(raw, self._weights, self._avatar.transforms(motion))
+            face = raw.means[: avatar.neutral.n]
+            face += pose_offsets(feature, self._pose_basis)
+            return self._kernels.skin(raw, self._weights, transforms)
 
     def _blend(self, coefficients: list[Float[Tensor, " k"]]) -> GaussianParams:
         blended = {}

@@ -53,7 +53,7 @@ def create(
         head: Head model: open, or flame or flame2023 once you have added it (toonifygb assets add flame).
         choose_face: Which face to follow: largest, left, right, centre, or a number counted from the left.
         max_frames: Use only the first frames.
-        backend: Rasteriser: auto, native or reference.
+        backend: Rasteriser: auto, cuda, gsplat, native or reference.
         threads: Threads of the native engine; all cores when unset.
         settings: Any other setting by name, for instance train.steps=500.
         quiet: Say nothing but errors.
@@ -222,7 +222,7 @@ def render(
         size: Side of the square picture, px.
         n_frames: Length of the video; the whole motion when unset.
         background: black, white, or a colour as #rrggbb.
-        backend: Rasteriser: auto, native or reference.
+        backend: Rasteriser: auto, cuda, gsplat, native or reference.
         threads: Threads of the native engine.
         quiet: Say nothing but errors.
     """

@@ -55,8 +55,11 @@ def _renderer() -> str:
 def _gpu() -> str:
     import torch
 
+    from toonifygb.render import cuda
+
     if torch.cuda.is_available():
-        return f"  GPU: {torch.cuda.get_device_name()}"
+        reason = cuda.unavailable()
+        return f"  GPU: {torch.cuda.get_device_name()}" if reason is None else f"! GPU: not used, because {reason}"
     return "  GPU: none; everything runs on the processor"
 
 

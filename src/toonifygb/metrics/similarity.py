@@ -58,15 +58,15 @@ def _blur(images: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
     # All images as channels of one: depthwise convolution is some 25 times faster than as many single channels.
     channels = images.reshape(1, -1, *images.shape[-2:])
     n, half = channels.shape[1], SSIM_WINDOW // 2
-    kernel = torch.tensor(_window(), dtype=images.dtype, device=images.device).expand(n, 1, -1)
+    kernel = torch.tensor(ssim_window(), dtype=images.dtype, device=images.device).expand(n, 1, -1)
     channels = torch.nn.functional.conv2d(channels, kernel[..., :, None], padding=(half, 0), groups=n)
     channels = torch.nn.functional.conv2d(channels, kernel[..., None, :], padding=(0, half), groups=n)
     return channels.reshape(images.shape)
 
 
 @cache
-def _window() -> tuple[float, ...]:
-    """The Gaussian's weights, summing to 1."""
+def ssim_window() -> tuple[float, ...]:
+    """Weights of the Gaussian that SSIM looks through, summing to 1."""
     half = SSIM_WINDOW // 2
     weights = [math.exp(-(offset**2) / (2 * SSIM_SIGMA**2)) for offset in range(-half, half + 1)]
     return tuple(weight / sum(weights) for weight in weights)

@@ -94,7 +94,7 @@ def posed(model: avatars.Avatar, weights: dict[str, float]) -> HeadMotion:
 
 def to_uint8(color: torch.Tensor) -> np.ndarray:
     """Float image 0..1 as rounded uint8."""
-    return (color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    return (color.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
 def resized(camera: Camera, size: int) -> Camera:

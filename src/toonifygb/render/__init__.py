@@ -1,4 +1,4 @@
-"""Renderers: a readable reference, and the native CPU engine that must agree with it."""
+"""Renderers: a readable reference, the native CPU engine and CUDA kernels that must agree with it."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import functools
 import logging
 from typing import TYPE_CHECKING
 
+import torch
+
 from toonifygb.errors import InputError
-from toonifygb.render import library
+from toonifygb.render import cuda, library
 from toonifygb.render.base import DEFAULT_CONSTANTS, RasterConstants, Renderer, RenderInfo
 
 if TYPE_CHECKING:
@@ -17,16 +19,22 @@ __all__ = ["DEFAULT_CONSTANTS", "RasterConstants", "RenderInfo", "Renderer", "ge
 
 log = logging.getLogger(__name__)
 
-BACKENDS = ("auto", "native", "reference")
+BACKENDS = ("auto", "cuda", "gsplat", "native", "reference")
 
 
 @functools.cache
 def resolve_backend(backend: str) -> str:
-    """``native`` or ``reference`` for a backend's name; says once in the log what ``auto`` became and why."""
+    """The backend that a name stands for; says once in the log what ``auto`` became and why."""
     if backend not in BACKENDS:
         raise InputError(f"backend is {backend!r}, expected one of {', '.join(BACKENDS)}", "use auto")
     if backend != "auto":
         return backend
+    if torch.cuda.is_available():
+        reason = cuda.unavailable()
+        if reason is None:
+            log.info("backend auto: CUDA (%s)", torch.cuda.get_device_name())
+            return "cuda"
+        log.warning("backend auto: the processor, because CUDA cannot be used: %s", reason)
     reason = library.unavailable()
     if reason is None:
         log.info("backend auto: native engine (%s)", library.isa())
@@ -39,14 +47,18 @@ def get(backend: str = "auto", threads: int | None = None) -> Renderer:
     """Renderer by name.
 
     Args:
-        backend: ``native``, ``reference``, or ``auto``: native where it is built.
+        backend: ``cuda`` (Triton), ``gsplat``, ``native``, ``reference``, or ``auto``: cuda where there is a device
+            for it, else native where it is built.
         threads: threads of the native engine; all available processors when ``None``.
 
     Raises:
         InputError: no such backend.
-        BackendError: ``native`` was asked for and is not available.
+        BackendError: a backend was asked for by name and is not available.
     """
-    if resolve_backend(backend) == "native":
+    name = resolve_backend(backend)
+    if name in ("cuda", "gsplat"):
+        return cuda.CudaRenderer() if name == "cuda" else cuda.GsplatRenderer()
+    if name == "native":
         from toonifygb.render.native import NativeRenderer
 
         return NativeRenderer(threads)
@@ -57,7 +69,12 @@ def get(backend: str = "auto", threads: int | None = None) -> Renderer:
 
 def kernels(backend: str = "auto", threads: int | None = None) -> Kernels:
     """Fused training kernels by name; arguments and errors as in ``get``."""
-    if resolve_backend(backend) == "native":
+    name = resolve_backend(backend)
+    if name in ("cuda", "gsplat"):
+        from toonifygb.render.cuda_fused import CudaKernels
+
+        return CudaKernels()
+    if name == "native":
         from toonifygb.render.native_fused import NativeKernels
 
         return NativeKernels(threads)

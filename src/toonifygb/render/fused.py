@@ -29,6 +29,8 @@ class Kernels(Protocol):
     """What a training step computes besides rendering. Steps change their tensors in place."""
 
     name: str
+    device: torch.device
+    """Where the tensors given to it have to be."""
 
     def blend(
         self,
@@ -188,9 +190,16 @@ def check_blend_step(deltas: Tensor, scale: Tensor | None, widths: Sequence[int]
 
 
 class ReferenceKernels:
-    """The definition of every kernel, in plain torch and any floating dtype."""
+    """The definition of every kernel, in plain torch, any floating dtype and on any device.
+
+    Args:
+        device: what ``Kernels.device`` says; callers bring their tensors there.
+    """
 
     name = "reference"
+
+    def __init__(self, device: torch.device | str = "cpu") -> None:
+        self.device = torch.device(device)
 
     def blend(
         self,

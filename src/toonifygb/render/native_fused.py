@@ -72,6 +72,7 @@ class NativeKernels:
     """
 
     name = "native"
+    device = torch.device("cpu")
 
     def __init__(self, threads: int | None = None) -> None:
         self._engine = library.load()

@@ -108,7 +108,7 @@ def _covariances(
     clamped = torch.maximum(torch.minimum(ratio, limit), -limit) * z
     held = torch.where(ratio.abs() > limit, clamped.detach(), points[:, :2])
     jacobian = points.new_zeros(len(points), 2, 3)
-    jacobian[:, [0, 1], [0, 1]] = focal / z
+    jacobian[:, 0, 0], jacobian[:, 1, 1] = (focal / z).unbind(-1)
     jacobian[:, :, 2] = -focal * held / (z * z)
     half = rotations.quat_to_matrix(splats.quats) * splats.scales[:, None, :]
     root = jacobian @ R @ half

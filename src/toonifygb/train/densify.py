@@ -107,7 +107,7 @@ class Densifier:
         parents, new, split, counts = [], [], [], []
         start = 0
         for group, (count, first) in enumerate(zip(_sizes(state.counts), _sizes(self._first), strict=True)):
-            ids = torch.arange(start, start + count)
+            ids = torch.arange(start, start + count, device=pull.device)
             threshold = rules.face_threshold if group < 2 else rules.mouth_threshold
             grows = _strongest(pull[ids] * ~dies[ids], threshold, int(rules.max_growth * first) - count)
             large = largest[ids] > rules.clone_below
@@ -117,8 +117,8 @@ class Densifier:
             if len(stays) + len(clones) + len(splits) == 0 and count:
                 stays = ids[values.opacity_logits[ids].argmax()][None]
             parents += [stays, clones, splits]
-            new += [torch.zeros(len(stays)), torch.ones(len(clones) + len(splits))]
-            split += [torch.zeros(len(stays) + len(clones)), torch.ones(len(splits))]
+            new += [ids.new_zeros(len(stays)), ids.new_ones(len(clones) + len(splits))]
+            split += [ids.new_zeros(len(stays) + len(clones)), ids.new_ones(len(splits))]
             counts.append(len(stays) + len(clones) + len(splits))
             start += count
         return Lineage(torch.cat(parents), torch.cat(new).bool(), torch.cat(split).bool(), Counts(*counts))
@@ -135,7 +135,7 @@ def succeed(state: TrainState, lineage: Lineage, rules: DensifyRules) -> None:
     state.skin_weights = state.skin_weights[lineage.parent]
     state.pose_basis = state.pose_basis[:, face].contiguous()
     state.counts = lineage.counts
-    state.pull, state.views = torch.zeros(lineage.counts.all), torch.zeros(lineage.counts.all)
+    state.pull, state.views = state.pull.new_zeros(lineage.counts.all), state.views.new_zeros(lineage.counts.all)
     _scatter_children(state.neutral.values, lineage.is_split, rules.split_shrink, state.generator)
 
 
@@ -156,7 +156,7 @@ def _scatter_children(
     """Places the children of splits at random inside their parent and shrinks them, in place."""
     ids = split.nonzero()[:, 0]
     scales = values.log_scales[ids].exp()
-    own = scales * torch.randn(scales.shape, generator=generator)
+    own = scales * torch.randn(scales.shape, generator=generator).to(scales)
     turned = torch.einsum("nab,nb->na", quat_to_matrix(quat_normalize(values.quats[ids])), own)
     values.means[ids] += turned
     values.log_scales[ids] -= torch.tensor(shrink).log()

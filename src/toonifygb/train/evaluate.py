@@ -50,7 +50,7 @@ def evaluate(
     with torch.no_grad():
         for done, index in enumerate(frames, start=1):
             target, _ = dataset.target(index)
-            image = renderer.render(poser(sequence.motion[index]), dataset.camera(index)).color.clamp(0, 1)
+            image = renderer.render(poser(sequence.motion[index]), dataset.camera(index)).color.clamp(0, 1).cpu()
             for name, measure in (("psnr", psnr), ("psnr_per_channel", psnr_per_channel), ("ssim", ssim)):
                 table[name].append(float(measure(image, target)))
             progress.update(done, len(frames))

@@ -63,7 +63,7 @@ def train(
         head: the head model of the track.
         config: numbers of Gaussians and steps, weights, seed.
         out_dir: gets ``checkpoint.safetensors`` and ``metrics.jsonl``.
-        backend: ``auto``, ``native`` or ``reference``.
+        backend: see ``render.get``; the whole training lives on the device of ``cuda``.
         threads: threads of the native engine.
         progress: told after every step; figures ``loss`` and ``steps_per_s``.
 
@@ -75,18 +75,11 @@ def train(
     with one_torch_thread():
         template = first_avatar(dataset, sequence, head, config)
         facts = {"fingerprint": _fingerprint(config, dataset, sequence)}
-        state = _resumed(folder, facts) or TrainState.start(template, config.seed)
-        stepper = Stepper(
-            state,
-            template,
-            dataset,
-            sequence,
-            config,
-            render.get(backend, threads),
-            render.kernels(backend, threads),
-        )
+        renderer, kernels = render.get(backend, threads), render.kernels(backend, threads)
+        state = (_resumed(folder, facts) or TrainState.start(template, config.seed)).to(kernels.device)
+        stepper = Stepper(state, template, dataset, sequence, config, renderer, kernels)
         _run(stepper, folder, config, facts, progress)
-        return _with_facts(state.avatar(template), sequence, dataset, config)
+        return _with_facts(state.to(torch.device("cpu")).avatar(template), sequence, dataset, config)
 
 
 def first_avatar(dataset: Dataset, sequence: TrackedSequence, head: HeadModel, config: TrainConfig) -> Avatar:

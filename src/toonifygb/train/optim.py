@@ -9,8 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import torch
-
 from toonifygb.avatar.fields import FIELDS, each, rows, width
 from toonifygb.structures import GaussianParams
 
@@ -159,9 +157,9 @@ def _rates(params: GaussianParams, rates: dict[str, float]) -> dict[str, Tensor]
     tables = {}
     for name in FIELDS:
         if name == "sh":
-            table = torch.full((n, k, 3), rates["sh_rest"])
+            table = params.sh.new_full((n, k, 3), rates["sh_rest"])
             table[:, 0] = rates["sh_dc"]
             tables[name] = table.view(-1)
         else:
-            tables[name] = torch.full((n * width(name, k),), rates[name])
+            tables[name] = params.sh.new_full((n * width(name, k),), rates[name])
     return tables

@@ -105,8 +105,9 @@ def refine_track(
             full_camera=small.full_camera,
             views=TrainingViews(small, sequence, head),
         )
-        state = TrainState.start(avatar, seed)
-        stepper = Stepper(state, avatar, small, sequence, config, renderer, render.kernels(backend, threads))
+        kernels = render.kernels(backend, threads)
+        state = TrainState.start(avatar, seed).to(kernels.device)
+        stepper = Stepper(state, avatar, small, sequence, config, renderer, kernels)
         rigid = _above_chin(state, sequence, head)
         prior = _prior(avatar, head)
         earlier = torch.zeros(sequence.n_frames, len(prior))
@@ -134,7 +135,7 @@ def refine_track(
 def _above_chin(state: TrainState, sequence: TrackedSequence, head: HeadModel) -> Bool[Tensor, " n"]:
     """Which Gaussians turn with the skull: those of the neck stay with the shoulders and would hold it back."""
     chin = head.landmarks().subset(torch.tensor([CHIN])).rest(sequence.shape)[0, 1]
-    return state.neutral.values.means[:, 1] > chin
+    return state.neutral.values.means[:, 1].cpu() > chin
 
 
 def _prior(avatar: Avatar, head: HeadModel) -> Float[Tensor, " c"]:
@@ -171,14 +172,14 @@ class _Look:
     def slope(self, index: int) -> Float[Tensor, " c"]:
         """Half the derivative of one frame's squared image error by a change, to first order."""
         pull = self.stepper.pull(index, _errors)
-        means, forces = pull.splats.means, pull.world.means
+        means, forces = pull.splats.means.cpu(), pull.world.means.cpu()
         arm, force = (means - self._pivot[index])[self.rigid], forces[self.rigid]
-        lever = self.stepper.state.skin_weights[:, JAW, None] * (means - self._jaw[index])
+        lever = self.stepper.state.skin_weights[:, JAW, None].cpu() * (means - self._jaw[index])
         torque = torch.linalg.cross(lever, forces).sum(0)
         blend = torch.zeros(self.poses.width - RIGID - 3)
         for name, delta in each(self.stepper.state.expression.values):
             matrix = rows(delta)
-            blend += matrix @ getattr(pull.raw, name).reshape(-1)[: matrix.shape[1]]
+            blend += (matrix @ getattr(pull.raw, name).reshape(-1)[: matrix.shape[1]]).cpu()
         turn = torch.linalg.cross(arm, force).sum(0)
         return torch.cat([turn, force.sum(0), self._rotation[index].mT @ torque, blend])
 

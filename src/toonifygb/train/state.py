@@ -129,6 +129,11 @@ class TrainState:
             generator=torch.Generator().manual_seed(seed),
         )
 
+    def to(self, device: torch.device) -> TrainState:
+        """The training with its tensors on a device; what chooses frames stays on the processor."""
+        names = ("neutral", "expression", "driver", "scale", "skin_weights", "pose_basis", "pull", "views")
+        return replace(self, **{name: getattr(self, name).to(device) for name in names})
+
     def next_frame(self, frames: tuple[int, ...]) -> int:
         """The next training frame: every epoch takes each frame once, in a new random order."""
         if self.position >= len(self.order):
@@ -160,6 +165,7 @@ _TRAINED = ("neutral", "expression", "driver")
 
 def write_checkpoint(state: TrainState, path: Path, facts: dict[str, Any]) -> None:
     """Writes the state atomically: a process killed at any moment leaves the old file or the new one."""
+    state = state.to(torch.device("cpu"))
     tensors = {name: getattr(state, name) for name in _TENSORS}
     tensors |= {name: tensor for group in _TRAINED for name, tensor in _named(group, getattr(state, group))}
     tensors["generator"] = state.generator.get_state()

@@ -66,7 +66,7 @@ class Stepper:
     """Takes steps of a training; everything that does not change from step to step is prepared here.
 
     Args:
-        state: changed in place by ``step``.
+        state: changed in place by ``step``; its tensors are where the kernels want them.
         template: the avatar's unchanging parts.
         dataset: crops, mattes, cameras, split.
         sequence: motion of every frame.
@@ -93,16 +93,17 @@ class Stepper:
         self._kernels = kernels
         self._weights = LossWeights.of(config)
         self._template = template
-        self._mouth = MouthVolume.around(join([template.mouth_upper, template.mouth_lower]).means)
+        mouth = MouthVolume.around(join([template.mouth_upper, template.mouth_lower]).means)
+        self._mouth = mouth.to(kernels.device)
         self.follow(sequence)
         self.rebind()
 
     def follow(self, sequence: TrackedSequence) -> None:
         """Takes the motion of every frame from a track."""
-        template = self._template
-        self._transforms = template.transforms(sequence.motion)
-        self._features = template.pose_feature(sequence.motion)
-        psi = template.coefficients(sequence.motion)
+        template, device = self._template, self._kernels.device
+        self._transforms = template.transforms(sequence.motion).to(device)
+        self._features = template.pose_feature(sequence.motion).to(device)
+        psi = template.coefficients(sequence.motion).to(device)
         n_expression = template.n_expressions + template.n_eyelids
         self._expression = psi[:, :n_expression].contiguous()
         self._driver = psi[:, n_expression:].contiguous()
@@ -126,12 +127,12 @@ class Stepper:
         return terms
 
     def splats(self, index: int) -> Splats:
-        """All Gaussians as they stand now, in the pose of one frame, world space."""
-        return self._posed(self._frame(index))[1]
+        """All Gaussians as they stand now, in the pose of one frame, world space; on the processor."""
+        return self._posed(self._frame(index))[1].to("cpu")
 
     def splats_of(self, motion: HeadMotion) -> Splats:
         """The same for any motion, no batch axis."""
-        return self._posed(self._motion(motion))[1]
+        return self._posed(self._motion(motion))[1].to("cpu")
 
     def pull(self, index: int, errors: ImageErrors, info: RenderInfo | None = None) -> Pull:
         """How errors of one frame's picture pull at the Gaussians.
@@ -148,7 +149,7 @@ class Stepper:
         cut_off = Splats(*leaves, sh_frames=splats.sh_frames)
         camera = self._dataset.camera(index)
         rendering = self._renderer.render(cut_off, camera, sh_degree=self.sh_degree, info=info)
-        slopes = errors(rendering, *self._dataset.target(index))
+        slopes = errors(rendering, *self._dataset.target(index, self._kernels.device))
         world = Splats(*torch.autograd.grad([rendering.color, rendering.alpha], leaves, slopes))
         return Pull(
             splats, world, self._kernels.skin_gradient(raw, self.state.skin_weights, frame.transforms, world)
@@ -162,12 +163,13 @@ class Stepper:
         )
 
     def _motion(self, motion: HeadMotion) -> _Frame:
-        psi = self._template.coefficients(motion)
+        template, device = self._template, self._kernels.device
+        psi = template.coefficients(motion).to(device)
         n = self._expression.shape[-1]
         return _Frame(
             Coefficients(psi[:n], psi[n:]),
-            self._template.pose_feature(motion),
-            self._template.transforms(motion),
+            template.pose_feature(motion).to(device),
+            template.transforms(motion).to(device),
         )
 
     def _posed(self, frame: _Frame) -> tuple[GaussianParams, Splats]:
