@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from toonifygb.cli.assets import assets
 from toonifygb.cli.progress import Terminal
+from toonifygb.cli.style import style
 from toonifygb.config import PRESETS, FaceConfig, Quality, RunConfig, StylizeConfig, TrackConfig, TrackOn, override
 
 if TYPE_CHECKING:
@@ -235,6 +236,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "train": train,
     "render": render,
     "assets": assets,
+    "style": style,
     "doctor": doctor,
 }
 
