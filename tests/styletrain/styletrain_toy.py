@@ -11,7 +11,7 @@ import torch
 
 from toonifygb import video
 from toonifygb.config import StyleTrainConfig
-from toonifygb.styletrain import encode, foundation
+from toonifygb.styletrain import encode, foundation, preview
 from toonifygb.stylize.styleganex import PUBLISHED, StyleGANEX, generator, weights
 
 SIDE = 64
@@ -21,9 +21,9 @@ RED = (230, 60, 70)
 TOY = StyleTrainConfig(
     resolution=SIDE,  # type: ignore[arg-type]
     aligned=True,
-    generator_steps=3,
+    generator_steps=2,
     generator_batch=2,
-    encoder_steps=4,
+    encoder_steps=3,
     encoder_batch=1,
     checkpoint_seconds=0.0,
     preview_steps=100,
@@ -36,13 +36,20 @@ def shrink_networks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(generator, "START_SIZE", SIDE // 8)
     monkeypatch.setattr(encode, "INPUT_SIZE", SIDE)
     monkeypatch.setitem(foundation.LEVELS, SIDE, 6)
+    monkeypatch.setattr(preview, "N_FACES", 2)
 
 
 def make_base(seed: int = 0) -> StyleGANEX:
     """A base network with weights by seed."""
-    # With nothing trained, fan-in scaling keeps every layer alive.
     torch.manual_seed(seed)
     network = StyleGANEX(dataclasses.replace(PUBLISHED["inversion"], width=WIDTH))
+    with torch.no_grad():
+        # Fresh layers let through little of the picture; trained ones let features and codes of unit size out.
+        network.encoder.featlayer.weight.mul_(8)
+        for head in network.encoder.styles:
+            head.linear.weight.mul_(20)  # type: ignore[union-attr]
+        for layer in (network.decoder.to_rgb1, *network.decoder.to_rgbs):
+            layer.conv.weight.mul_(3)  # type: ignore[union-attr]
     network.latent_avg.normal_(generator=torch.Generator().manual_seed(seed)).mul_(0.3)
     return network.requires_grad_(False)
 
