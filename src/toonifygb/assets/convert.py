@@ -220,8 +220,8 @@ def _read_stream(data: memoryview, path: Path) -> Any:
 class _Keys:
     """Follows the unpickler's stack and lets nothing become a key but strings and whole numbers.
 
-    Keys are hashed, and a tuple hashes all it holds, each time: one whose two items are the same tuple, and so on 60
-    times, is written in 300 bytes and takes longer than a life.
+    Keys are hashed, and a tuple hashes all it holds, each time: one whose two items are the same tuple, and so on
+    60 times, is written in 300 bytes and takes longer than a life.
     """
 
     def __init__(self, path: Path) -> None:
@@ -258,7 +258,7 @@ class _Keys:
     def _take(self, instruction: pickletools.OpcodeInfo) -> None:
         """What an ordinary instruction takes off the stack and lays on it."""
         before = instruction.stack_before
-        if pickletools.stackslice in before or instruction.name == "POP_MARK":
+        if pickletools.stackslice in before:
             del self._stack[len(self._stack) - len(self._above_mark()) - 1 :]
             before = before[: before.index(pickletools.markobject)]
         for _ in before:
