@@ -98,7 +98,8 @@ def test_interrupted_twice_equals_uninterrupted(tmp_path: Path) -> None:
     assert one.keys() == two.keys()
     assert all(torch.equal(one[key], two[key]) for key in one)
     previews = {path.name for path in (tmp_path / "broken.training" / "previews").iterdir()}
-    assert previews == {"generator-000002.png", "encoder-000003.png"}
+    names = [f"{stem}{suffix}" for stem in ("generator-000002", "encoder-000003") for suffix in (".png", ".json")]
+    assert previews == set(names)
 
     _stylises_a_clip(whole)
     with pytest.raises(InputError, match="another base or other settings"):

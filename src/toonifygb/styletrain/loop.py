@@ -4,7 +4,7 @@
     STYLE.training/pictures.safetensors     the aligned pictures
     STYLE.training/generator.safetensors    first stage: everything a step depends on
     STYLE.training/encoder.safetensors      second stage, likewise
-    STYLE.training/previews/*.png           what has been learnt after so many steps
+    STYLE.training/previews/*.png, *.json   what has been learnt after so many steps, and the losses
 
 All that is random in a step follows from the seed, the stage and the step's number, so no random state need be kept
 and a resumed training equals an uninterrupted one bit for bit (on the CPU; GPU kernels may add in another order).
@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 
+from toonifygb.atomic import replacing
 from toonifygb.errors import BackendError, InputError
 from toonifygb.progress import Stopped
 from toonifygb.styletrain import preview
@@ -42,9 +43,9 @@ if TYPE_CHECKING:
 
     from toonifygb.config import StyleTrainConfig
     from toonifygb.progress import Progress
-    from toonifygb.styletrain.perceptual import Perceptual
     from toonifygb.styletrain.pictures import Pictures
     from toonifygb.styletrain.state import Tensors
+    from toonifygb.stylize.styleganex.generator import Generator
 
 SUFFIX = ".safetensors"
 _SMOOTHING = 0.05
@@ -127,34 +128,30 @@ def train_style(images: Path, base: str, out: Path, config: StyleTrainConfig, re
         reporter.note(sentence)
     runner = _Runner(folder, config, _fingerprint(config, pictures, foundation), reporter)
     foundation.network.to(device)
-    transfer = _taught(foundation, pictures, config, runner)
-    encode = _encoded(transfer, perceptual, config, runner)
-    weights.save(encode.network.cpu(), out)
+    decoder, discriminator = _taught(foundation, pictures, config, runner)
+    distance = perceptual or FeatureDistance(copy.deepcopy(discriminator))
+    reporter.note(f"perceptual distance: {distance.description}")
+    network = student(foundation.network, decoder, config.seed).to(device)
+    stage = Encode(foundation.network, network, discriminator, distance, config)
+    runner.run(
+        stage,
+        _Plan("encoder", "teaching the encoder", config.encoder_steps, lambda: preview.of_encode(stage)),
+    )
+    weights.save(network.cpu(), out)
 
 
-def _taught(foundation: Foundation, pictures: Pictures, config: StyleTrainConfig, runner: _Runner) -> Transfer:
-    """The first stage, run to its end."""
-    network = foundation.network
-    discriminator = _discriminator(foundation, config, runner.reporter).to(network.latent_avg.device)
-    stage = Transfer(network, discriminator, pictures.images, config)
-    plan = _Plan("generator", "teaching the generator", config.generator_steps, lambda: preview.of_transfer(stage))
-    runner.run(stage, plan)
-    return stage
-
-
-def _encoded(
-    transfer: Transfer, perceptual: Perceptual | None, config: StyleTrainConfig, runner: _Runner
-) -> Encode:
-    """The second stage, run to its end."""
-    base = transfer.base
-    decoder = swapped(base.decoder, transfer.average, config.swap, config.swap_size)
-    network = student(base, decoder, config.seed).to(base.latent_avg.device)
-    distance = perceptual or FeatureDistance(copy.deepcopy(transfer.discriminator))
-    runner.reporter.note(f"perceptual distance: {distance.description}")
-    stage = Encode(base, network, transfer.discriminator, distance, config)
-    plan = _Plan("encoder", "teaching the encoder", config.encoder_steps, lambda: preview.of_encode(stage))
-    runner.run(stage, plan)
-    return stage
+def _taught(
+    foundation: Foundation, pictures: Pictures, config: StyleTrainConfig, runner: _Runner
+) -> tuple[Generator, Discriminator]:
+    """The first stage, run to its end: the generator of the style, layers swapped, and its discriminator."""
+    base = foundation.network
+    discriminator = _discriminator(foundation, config, runner.reporter).to(base.latent_avg.device)
+    stage = Transfer(base, discriminator, pictures.images, config)
+    runner.run(
+        stage,
+        _Plan("generator", "teaching the generator", config.generator_steps, lambda: preview.of_transfer(stage)),
+    )
+    return swapped(base.decoder, stage.average, config.swap, config.swap_size), discriminator
 
 
 def _discriminator(foundation: Foundation, config: StyleTrainConfig, reporter: Reporter) -> Discriminator:
@@ -206,7 +203,7 @@ class _Runner:
                 }
                 step += 1
                 if step % self.config.preview_steps == 0 or step == plan.n_steps:
-                    self._preview(plan, step)
+                    self._preview(plan, step, figures)
                 if time.monotonic() - saved >= self.config.checkpoint_seconds:
                     self._save(stage, path, step)
                     saved = time.monotonic()
@@ -234,12 +231,16 @@ class _Runner:
             )
         return figures
 
-    def _preview(self, plan: _Plan, step: int) -> None:
+    def _preview(self, plan: _Plan, step: int, figures: dict[str, float]) -> None:
+        """Writes a picture of what has been learnt, and the losses beside it."""
         folder = self.folder / "previews"
         folder.mkdir(exist_ok=True)
+        path = folder / f"{plan.name}-{step:06}.png"
         with torch.random.fork_rng():
             torch.manual_seed(0)
-            save_png(folder / f"{plan.name}-{step:06}.png", plan.draw_preview().numpy())
+            save_png(path, plan.draw_preview().numpy())
+        with replacing(path.with_suffix(".json")) as temporary:
+            temporary.write_text(json.dumps({"step": step, **figures}, indent=1) + "\n", encoding="utf-8")
 
     def _save(self, stage: Stage, path: Path, step: int) -> None:
         notes = {"fingerprint": self.fingerprint, "step": step, "stage": stage.notes()}
