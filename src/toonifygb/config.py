@@ -26,8 +26,8 @@ class StylizeConfig:
     """Stage 1: how each frame is stylised."""
 
     style: str = "toon"
-    """toon, paint, ink or none; a style with weights of its own (arcane, cartoon, pixar); or a file: a model, .onnx
-    or .ts, or a style that was trained, .safetensors."""
+    """toon, paint, ink or none; a style with weights of its own (arcane, cartoon, pixar, age, hair); or a file: a
+    model, .onnx or .ts, or a style that was trained, .safetensors."""
     strength: float = 1.0
     """Blend between the original (0) and the full style (1)."""
 

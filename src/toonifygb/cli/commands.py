@@ -35,7 +35,7 @@ def create(
     Args:
         clip: Video file or folder of images with one person's head.
         out: Folder of the run; runs/<clip name>-<style> when unset.
-        style: toon, paint, ink or none; arcane, cartoon or pixar (assets get styleganex-...); or a model file.
+        style: toon, paint, ink or none; arcane, cartoon, pixar, age or hair (assets get styleganex-...); or a file.
         quality: draft (minutes), standard, or paper (the published regime).
         strength: Blend between the original (0) and the full style (1).
         track_on: Video whose landmarks the head model is fitted to.
@@ -66,7 +66,7 @@ def demo(
 
     Args:
         out: Folder of the run.
-        style: toon, paint, ink or none; arcane, cartoon or pixar (assets get styleganex-...); or a model file.
+        style: toon, paint, ink or none; arcane, cartoon, pixar, age or hair (assets get styleganex-...); or a file.
         n_frames: Length of the synthetic clip.
         seed: Which synthetic person.
         quiet: Say nothing but errors.
@@ -97,7 +97,7 @@ def stylize(
     Args:
         clip: Video file or folder of images.
         out: Video file to write (.mp4).
-        style: toon, paint, ink or none; arcane, cartoon or pixar (assets get styleganex-...); or a model file.
+        style: toon, paint, ink or none; arcane, cartoon, pixar, age or hair (assets get styleganex-...); or a file.
         strength: Blend between the original (0) and the full style (1).
         choose_face: Which face to follow where several are visible.
         max_frames: Use only the first frames.

@@ -120,8 +120,8 @@ def train_style(images: Path, base: str, out: Path, config: StyleTrainConfig, re
     check_folder(images)
     perceptual = Lpips.read(config.lpips).to(device) if config.lpips else None
     folder = out.with_suffix(".training")
-    folder.mkdir(parents=True, exist_ok=True)
     foundation = open_foundation(base, folder)
+    folder.mkdir(parents=True, exist_ok=True)
     reader = reporter.stage("pictures", "finding the faces")
     pictures = read_pictures(images, config, folder / "pictures.safetensors", device, reader)
     for sentence in pictures.problems:
