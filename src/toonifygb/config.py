@@ -18,6 +18,7 @@ from toonifygb.errors import InputError
 
 Quality = Literal["draft", "standard", "paper"]
 TrackOn = Literal["auto", "original", "stylized"]
+Storage = Literal["compact", "full"]
 Framing = Literal["auto", "full", "crop", "published", "aligned"]
 
 
@@ -128,6 +129,8 @@ class TrainConfig:
     loss: Literal["3dgb", "seed"] = "3dgb"
     """3dgb: the weights above; seed: the paper's printed variant (0.2 L1 + 0.8 D-SSIM, one mean over both
     mouth sets)."""
+    storage: Storage = "compact"
+    """How the avatar is written: compact (a tenth of the room, for less than 0.1 dB) or full (single precision)."""
     checkpoint_seconds: float = 30.0
     """Time between checkpoints."""
     test_share: float = 0.15

@@ -11,7 +11,7 @@ import torch
 from make import tiny_avatar, tiny_motion
 from safetensors.torch import load_file, save_file
 
-from toonifygb.avatar import load, save
+from toonifygb.avatar import load, packing, save
 from toonifygb.avatar.save import _digest
 from toonifygb.errors import InputError
 from toonifygb.structures import TensorRecord
@@ -65,17 +65,32 @@ def test_unmoved_gaussians_take_no_room(tmp_path: Path) -> None:
     assert_same(avatar, load(tmp_path))
 
 
-def test_compact_deltas_hardly_differ(tmp_path: Path) -> None:
+def test_compact_storage_is_small_and_hardly_differs(tmp_path: Path) -> None:
     avatar = tiny_avatar()
     save(avatar, tmp_path / "full")
-    save(avatar, tmp_path / "compact", compact=True)
+    save(avatar, tmp_path / "compact", storage="compact")
     sizes = [(tmp_path / kind / "avatar.safetensors").stat().st_size for kind in ("full", "compact")]
-    assert sizes[1] < 0.65 * sizes[0]
+    assert sizes[1] < 0.45 * sizes[0]
     motion = tiny_motion()[4]
     exact, near = avatar.pose(motion), load(tmp_path / "compact").pose(motion)
-    # Half precision keeps 11 bits: a 10 mm displacement is right to 5 µm.
+    # Half precision keeps 11 bits: a 10 mm displacement is right to 5 µm. Bytes keep 7 of the largest value.
     assert (exact.means - near.means).abs().max() < 2e-5
-    assert (exact.sh - near.sh).abs().max() < 2e-3
+    step = avatar.deltas.sh.abs().max() / packing.LEVELS
+    assert (exact.sh - near.sh).abs().max() < len(avatar.blendshape_names) * step
+
+
+def test_packed_deltas_are_right_to_half_a_step_and_zeros_stay_zero() -> None:
+    deltas = tiny_avatar().deltas
+    generator = torch.Generator().manual_seed(0)
+    live = torch.rand(deltas.opacity_logits.shape, generator=generator) < 0.3
+    sparse = deltas.map(lambda delta: delta * live.view(*live.shape, *[1] * (delta.ndim - 2)))
+    found = packing.unpack(packing.pack(sparse), live.shape[1])
+    for name in ("quats", "log_scales", "opacity_logits", "sh"):
+        exact, near = getattr(sparse, name), getattr(found, name)
+        step = exact.abs().amax(1, keepdim=True) / packing.LEVELS
+        assert ((exact - near).abs() <= 0.501 * step).all(), name
+        assert torch.equal(near[~live], exact[~live]), name
+    assert torch.equal(found.means, sparse.means.half().float())
 
 
 def test_a_new_avatar_replaces_the_old(tmp_path: Path) -> None:
@@ -110,6 +125,21 @@ def test_damage_is_told_in_one_sentence(tmp_path: Path) -> None:
         load(tmp_path)
 
 
+@pytest.mark.parametrize("damage", ["fewer values", "another number of blendshapes", "other channels"])
+def test_packed_deltas_must_fit_together(tmp_path: Path, damage: str) -> None:
+    save(tiny_avatar(), tmp_path, storage="compact")
+    tensors = load_file(tmp_path / "avatar.safetensors")
+    if damage == "fewer values":
+        tensors["packed.sh.values"] = tensors["packed.sh.values"][:-1]
+    elif damage == "another number of blendshapes":
+        tensors["packed.sh.steps"] = tensors["packed.sh.steps"][:-1]
+    else:
+        tensors["packed.quats.values"] = tensors["packed.quats.values"][:, :3].contiguous()
+    _replace_tensors(tmp_path, tensors)
+    with pytest.raises(InputError, match="do not fit together"):
+        load(tmp_path)
+
+
 @pytest.mark.parametrize("change", ["missing", "unknown", "misfit"])
 def test_tensors_must_be_exactly_the_expected_ones(tmp_path: Path, change: str) -> None:
     save(tiny_avatar(), tmp_path)
@@ -120,9 +150,14 @@ def test_tensors_must_be_exactly_the_expected_ones(tmp_path: Path, change: str) 
         tensors["neutral.secret"] = torch.zeros(1)
     else:
         tensors["skin_weights"] = torch.zeros(3, 5)
-    save_file(tensors, tmp_path / "avatar.safetensors")
-    facts = json.loads((tmp_path / "avatar.json").read_text())
-    facts["tensors_sha256"] = _digest(tmp_path / "avatar.safetensors")
-    (tmp_path / "avatar.json").write_text(json.dumps(facts))
+    _replace_tensors(tmp_path, tensors)
     with pytest.raises(InputError, match="skin_weights has shape" if change == "misfit" else "missing or unknown"):
         load(tmp_path)
+
+
+def _replace_tensors(folder: Path, tensors: dict[str, torch.Tensor]) -> None:
+    """Other tensors under a digest that fits them."""
+    save_file(tensors, folder / "avatar.safetensors")
+    facts = json.loads((folder / "avatar.json").read_text())
+    facts["tensors_sha256"] = _digest(folder / "avatar.safetensors")
+    (folder / "avatar.json").write_text(json.dumps(facts))

@@ -105,9 +105,18 @@ def test_boxes_hold_their_points(sequence: TrackedSequence) -> None:
     assert bool((boxes.head[:, 1] < boxes.face[:, 1]).all())
 
 
+def head_region(sequence: TrackedSequence) -> torch.Tensor:
+    """Region of the first frame, ending where the neck does."""
+    camera, head = sequence.camera, open_head()
+    mask = track.HeadRegion(sequence, head)(0)
+    first, kept = track.neck_cuts(sequence, head).rows(0, camera.height, camera.width)
+    mask[first:] *= kept
+    return mask
+
+
 def test_region_holds_face_and_hair_and_neck_but_not_the_shoulders(sequence: TrackedSequence) -> None:
     head = open_head()
-    mask = track.head_region(sequence, 0, head)
+    mask = head_region(sequence)
     assert mask.shape == (SIZE, SIZE)
     assert 0 <= float(mask.min()) <= float(mask.max()) <= 1
     points, box = sequence.landmarks.points[0], track.head_boxes(sequence, head).head[0]
@@ -122,9 +131,9 @@ def test_region_holds_face_and_hair_and_neck_but_not_the_shoulders(sequence: Tra
 
 
 def test_region_moves_with_the_head(sequence: TrackedSequence) -> None:
-    still = track.head_region(sequence, 0, open_head())
+    still = head_region(sequence)
     moved = replace(sequence.motion, translation=sequence.motion.translation + torch.tensor([0.05, 0.0, 0.0]))
-    other = track.head_region(replace(sequence, motion=moved), 0, open_head())
+    other = head_region(replace(sequence, motion=moved))
     x = torch.arange(SIZE) + 0.5
     shift = float((other.sum(0) * x).sum() / other.sum() - (still.sum(0) * x).sum() / still.sum())
     focal, depth = float(sequence.camera.K[0, 0]), 0.65
@@ -135,10 +144,40 @@ def test_region_of_a_picture_larger_than_the_grid_is_the_same_region(sequence: T
     camera = replace(
         sequence.camera, K=sequence.camera.K * torch.tensor([[2.0], [2.0], [1.0]]), width=1024, height=1024
     )
-    large = track.head_region(replace(sequence, camera=camera), 0, open_head())
+    large = head_region(replace(sequence, camera=camera))
     halved = torch.nn.functional.avg_pool2d(large[None, None], 2)[0, 0]
     # Both come from one grid of 256 px, once doubled and once fourfold.
-    assert (halved - track.head_region(sequence, 0, open_head())).abs().max() < 0.02
+    assert (halved - head_region(sequence)).abs().max() < 0.02
+
+
+def test_a_nod_leaves_the_end_of_the_neck_where_it_is(sequence: TrackedSequence) -> None:
+    joints = sequence.motion.joints.clone()
+    joints[:, 1, 0] += 0.3
+    still = track.neck_cuts(sequence, open_head())
+    nodded = track.neck_cuts(replace(sequence, motion=replace(sequence.motion, joints=joints)), open_head())
+    assert torch.equal(nodded.normal, still.normal) or (nodded.normal - still.normal).abs().max() < 0.02
+    middle = torch.tensor([SIZE / 2, 0.0])
+    ends = [(cuts.reach - cuts.normal @ middle) / cuts.normal[:, 1] for cuts in (still, nodded)]
+    assert (ends[1] - ends[0]).abs().max() < 0.01 * SIZE
+    turned = sequence.motion.joints.clone()
+    turned[:, 0, 2] += 0.3  # the whole body leans over, and the cut with it
+    leaning = track.neck_cuts(replace(sequence, motion=replace(sequence.motion, joints=turned)), open_head())
+    angle = torch.atan2(leaning.normal[:, 0], leaning.normal[:, 1]) - torch.atan2(
+        still.normal[:, 0], still.normal[:, 1]
+    )
+    assert (angle.abs() - 0.3).abs().max() < 0.05
+
+
+def test_cuts_in_crops_are_the_same_cuts(sequence: TrackedSequence) -> None:
+    cuts = track.neck_cuts(sequence, open_head())
+    n = sequence.n_frames
+    boxes = torch.tensor([[40.0, 60.0, 440.0, 460.0]]).expand(n, -1)
+    first, full = cuts.rows(0, SIZE, SIZE)
+    whole = torch.cat([torch.ones(first, SIZE), full])[60:460, 40:440]
+    first, part = cuts.within(boxes, 200).rows(0, 200, 200)
+    small = torch.cat([torch.ones(first, 200), part])
+    assert 0 < float(small.mean()) < 1
+    assert (small - torch.nn.functional.avg_pool2d(whole[None, None], 2)[0, 0]).abs().max() < 0.01
 
 
 def test_jitter_is_zero_for_steady_motion_and_three_sigma_for_noise() -> None:

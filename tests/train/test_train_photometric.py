@@ -10,11 +10,14 @@ import torch
 from make import TINY, tiny_avatar, tiny_head, tiny_sequence
 
 from toonifygb import render
-from toonifygb.avatar import Avatar
+from toonifygb.avatar import Avatar, init_avatar
 from toonifygb.geometry.rotations import matrix_to_axis_angle
 from toonifygb.structures import TrackedSequence
 from toonifygb.train import Dataset, build_dataset, photometric, refine_track
-from toonifygb.train.photometric import _Poses, carried
+from toonifygb.train.photometric import _Look
+from toonifygb.train.poses import RIGID, Poses, carried
+from toonifygb.train.state import TrainState
+from toonifygb.train.step import Stepper
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -60,7 +63,7 @@ def shaken(sequence: TrackedSequence) -> TrackedSequence:
 
 def scatter(sequence: TrackedSequence, truth: TrackedSequence) -> Tensor:
     """How far each head's turn is off, rad, what all have in common left out."""
-    ours, true = (_Poses(opaque_avatar(), s).rotation for s in (sequence, truth))
+    ours, true = (Poses(opaque_avatar(), tiny_head(), s).rotation for s in (sequence, truth))
     off = matrix_to_axis_angle(true.mT @ ours)
     return (off - off.mean(0)).norm(dim=-1)
 
@@ -68,10 +71,11 @@ def scatter(sequence: TrackedSequence, truth: TrackedSequence) -> Tensor:
 def test_moved_motion_carries_the_posed_avatar() -> None:
     avatar, sequence = opaque_avatar(), tiny_sequence()
     twist = torch.tensor([0.1, -0.2, 0.05, 0.01, 0.02, -0.03])
-    poses = _Poses(avatar, sequence)
+    poses = Poses(avatar, tiny_head(), sequence)
+    change = torch.cat([twist, torch.zeros(poses.width - RIGID)])
     splats = avatar.pose(sequence.motion[4])
     by_splats = carried(splats, twist, poses.pivot[4], torch.ones(len(splats.means), dtype=torch.bool))
-    by_motion = avatar.pose(poses.moved(twist.expand(sequence.n_frames, -1)).motion[4])
+    by_motion = avatar.pose(poses.moved(change.expand(sequence.n_frames, -1)).motion[4])
     on_head = torch.ones(len(splats.means), dtype=torch.bool)
     on_head[: avatar.neutral.n] = avatar.skin_weights[:, 0] == 0  # what hangs on the body stays with it
     assert (by_splats.means - by_motion.means)[on_head].abs().max() < 1e-6
@@ -92,14 +96,63 @@ def test_only_the_chosen_are_carried() -> None:
 def test_common_changes_are_left_to_the_avatar() -> None:
     """A turn of all heads in their own axes does not move them; one that differs from frame to frame does."""
     sequence = tiny_sequence()
-    poses, frames = _Poses(opaque_avatar(), sequence), torch.arange(2, 18)
+    poses, frames = Poses(opaque_avatar(), tiny_head(), sequence), torch.arange(2, 18)
     common = torch.tensor([[0.02, -0.01, 0.03], [0.001, 0.002, -0.004]])
-    same = torch.einsum("tab,kb->tka", poses.rotation, common).flatten(1)
+    heads = torch.einsum("tab,kb->tka", poses.rotation, common).flatten(1)
+    faces = torch.linspace(-0.1, 0.1, poses.width - RIGID).expand(len(heads), -1)
+    same = torch.cat([heads, faces], 1)
     nothing = torch.zeros_like(same)
     assert poses.without_common(same, nothing, frames)[frames].abs().max() < 1e-6
     own = nothing.clone()
     own[5, 0] = 0.1
     assert poses.without_common(own, nothing, frames)[5, 0] > 0.09
+
+
+def test_faces_stay_within_their_limits() -> None:
+    head, sequence = tiny_head(), tiny_sequence()
+    poses = Poses(opaque_avatar(), head, sequence)
+    far = torch.full((sequence.n_frames, poses.width), 10.0)
+    far[:, :9] = 0
+    motion = poses.moved(far).motion
+    assert torch.equal(motion.expression, head.expression_upper.maximum(sequence.motion.expression))
+    assert torch.equal(motion.eyelids, sequence.motion.eyelids.clamp_min(1))
+    below = poses.moved(-far).motion
+    assert torch.equal(below.expression, head.expression_lower.minimum(sequence.motion.expression))
+
+
+def test_slope_is_the_derivative_of_the_squared_error(tmp_path: Path) -> None:
+    """Of jaw, expression and lids, against central differences through posing and rendering."""
+    sequence, head, index = tiny_sequence(N, SIZE), tiny_head(), 4
+    dataset = filmed(opaque_avatar(), sequence, tmp_path)
+    config = replace(TINY, n_gaussians=400, resolution=SIZE)
+    avatar = init_avatar(head, sequence.shape, config, camera=dataset.camera(0), full_camera=dataset.full_camera)
+    avatar = replace(
+        avatar,
+        neutral=replace(avatar.neutral, opacity_logits=avatar.neutral.opacity_logits + 3),
+        pose_basis=0 * avatar.pose_basis,
+    )
+    renderer = render.get("auto", 1)
+    state = TrainState.start(avatar, 0)
+    stepper = Stepper(state, avatar, dataset, sequence, config, renderer, render.kernels("auto", 1))
+    poses = Poses(avatar, head, sequence)
+    look = _Look(stepper, dataset, poses, torch.ones(state.counts.all, dtype=torch.bool), renderer)
+    slope = look.slope(index)[RIGID:]
+
+    def error(changes: Tensor) -> float:
+        shown = renderer.render(stepper.splats_of(poses.faces(index, changes)[0]), dataset.camera(index))
+        color, matte = dataset.target(index)
+        return float((shown.color - color).double().square().sum() + (shown.alpha - matte).double().square().sum())
+
+    def numeric(number: int) -> float:
+        change = torch.zeros(1, poses.width)
+        change[0, number] = 2e-3
+        return (error(change) - error(-change)) / 8e-3
+
+    exact = torch.tensor([numeric(number) for number in range(RIGID, poses.width)])
+    jaw, units = slice(0, 3), slice(3, None)
+    # The jaw's is to first order in its own angle, and the turn of what it carries is left out.
+    assert (slope[jaw] - exact[jaw]).norm() < 0.25 * exact[jaw].norm()
+    assert (slope[units] - exact[units]).norm() < 0.15 * exact[units].norm()
 
 
 @pytest.mark.slow
@@ -113,8 +166,7 @@ def test_poses_are_found_in_both_sets(tmp_path: Path, monkeypatch: pytest.Monkey
     before, after = scatter(wrong, truth), scatter(found, truth)
     for frames in (list(dataset.split.train), list(dataset.split.test)):
         assert after[frames].mean() < 0.85 * before[frames].mean()
-    assert torch.equal(found.motion.expression, wrong.motion.expression)
-    assert torch.equal(found.motion.joints[:, 2:], wrong.motion.joints[:, 2:])
+    assert torch.equal(found.motion.joints[:, 3:], wrong.motion.joints[:, 3:])  # gaze
     assert torch.equal(found.motion.joints[:, 0], wrong.motion.joints[:, 0])
     again = refine_track(dataset, wrong, tiny_head(), threads=2)
     assert torch.equal(again.motion.joints, found.motion.joints)

@@ -19,7 +19,7 @@ from toonifygb import avatar as avatars
 from toonifygb import face, head, stylize, track, train, video
 from toonifygb.config import from_json, to_json
 from toonifygb.errors import FaceError, InputError
-from toonifygb.pipeline.files import LANDMARK_TRACK, load_landmarks, save_landmarks
+from toonifygb.pipeline.files import LANDMARK_TRACK, load_landmarks, open_crops, save_landmarks
 from toonifygb.pipeline.outcome import outcome
 from toonifygb.pipeline.segments import SEGMENT, Segments
 from toonifygb.pipeline.source import Source, open_style, style_inputs
@@ -236,7 +236,7 @@ def finish_track(run: Run, config: RunConfig, fitted: str, cut: str | None) -> s
         sequence = track.load(run.work(LANDMARK_TRACK))
         if dataset is not None:
             sequence = train.refine_track(
-                train.load_dataset(run.work("dataset")),
+                open_crops(run, sequence),
                 sequence,
                 head.load("open"),
                 seed=config.train.seed,
@@ -344,9 +344,10 @@ def train_avatar(run: Run, config: RunConfig, cut: str, tracked: str) -> str:
     out = run.file("avatar")
 
     def work(progress: Progress) -> None:
+        sequence = track.load(run.file("track.safetensors"))
         trained = train.train(
-            train.load_dataset(run.work("dataset")),
-            track.load(run.file("track.safetensors")),
+            open_crops(run, sequence),
+            sequence,
             head.load("open"),
             config.train,
             run.work("training"),
@@ -354,6 +355,6 @@ def train_avatar(run: Run, config: RunConfig, cut: str, tracked: str) -> str:
             threads=config.threads,
             progress=progress,
         )
-        avatars.save(trained, out)
+        avatars.save(trained, out, storage=config.train.storage)
 
     return run.stage("train", "training the avatar", inputs=[cut, tracked, config.train], outputs=[out], work=work)

@@ -4,18 +4,29 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from safetensors import SafetensorError, numpy, safe_open
 from safetensors.torch import save_file
 
+from toonifygb import head, track, train
 from toonifygb.atomic import replacing
 from toonifygb.errors import InputError
 from toonifygb.structures import Landmarks
 
+if TYPE_CHECKING:
+    from toonifygb.pipeline.stages import Run
+    from toonifygb.structures import TrackedSequence
+
 LANDMARK_TRACK = "landmark_track.safetensors"
 """Work file: the track before the pixels had their say."""
+
+
+def open_crops(run: Run, sequence: TrackedSequence) -> train.Dataset:
+    """The run's training set, with the necks ending where a track of its clip has them end."""
+    cuts = track.neck_cuts(sequence, head.load(sequence.head_model))
+    return train.load_dataset(run.work("dataset")).cut_at(cuts)
 
 
 def save_landmarks(landmarks: Landmarks, path: Path) -> None:

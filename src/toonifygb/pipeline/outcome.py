@@ -18,7 +18,7 @@ from toonifygb import __version__, head, metrics, stylize, track, train, video
 from toonifygb import avatar as avatars
 from toonifygb.atomic import replacing
 from toonifygb.pipeline import pictures
-from toonifygb.pipeline.files import LANDMARK_TRACK
+from toonifygb.pipeline.files import LANDMARK_TRACK, open_crops
 from toonifygb.pipeline.report import Curve, Picture, Report, render_report
 from toonifygb.pipeline.stages import peak_memory_mb, write_json
 from toonifygb.pipeline.viewing import AvatarViewer, posed
@@ -58,8 +58,8 @@ def score(source: Source, run: Run, config: RunConfig, trained: str) -> str:
     out = run.work("scores.json")
 
     def work(progress: Progress) -> None:
-        dataset = train.load_dataset(run.work("dataset"))
         sequence = track.load(run.file("track.safetensors"))
+        dataset = open_crops(run, sequence)
         model, engine = avatars.load(run.file("avatar")), {"backend": config.backend, "threads": config.threads}
         held_out = train.evaluate(model, dataset, sequence, dataset.split.test, **engine, progress=progress)
         by_landmarks = track.load(run.work(LANDMARK_TRACK))
@@ -166,8 +166,8 @@ def metrics_record(source: Source, run: Run, config: RunConfig, scores: dict[str
 
 def report_pictures(run: Run, config: RunConfig) -> dict[str, np.ndarray]:
     """The report's pictures by name, uint8 RGB."""
-    dataset = train.load_dataset(run.work("dataset"))
     sequence = track.load(run.file("track.safetensors"))
+    dataset = open_crops(run, sequence)
     model = avatars.load(run.file("avatar"))
     viewer = AvatarViewer(model, dataset.size, backend=config.backend, threads=config.threads)
     middle = model.motion_mean

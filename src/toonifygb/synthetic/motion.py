@@ -73,7 +73,7 @@ def make_motion(head: HeadModel, n_frames: int, fps: float, seed: int) -> HeadMo
 
     The head turns by its neck joint within ``YAW_DEG`` and ``PITCH_DEG``, the body sways a little with the root,
     the eyes turn against the head. The translation puts the head in front of a ``tracked_camera`` with a focal
-    length of 1.8 image heights.
+    length of 1.42 image heights.
     """
     rng = np.random.Generator(np.random.Philox(seed + 4000))
     time = np.arange(n_frames) / fps
@@ -86,7 +86,7 @@ def make_motion(head: HeadModel, n_frames: int, fps: float, seed: int) -> HeadMo
     sway = np.stack(
         [_wave(time, rng, rate, size) for rate, size in ((0.10, 0.008), (0.12, 0.005), (0.08, 0.014))], 1
     )
-    translation = sway + np.array((0.0, -0.004, -0.74))
+    translation = sway + np.array((0.0, -0.004, -0.585))
 
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(values, np.float32))

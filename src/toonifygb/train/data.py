@@ -7,6 +7,7 @@ follows the head smoothly; each frame's camera is cropped with it, so the world 
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from toonifygb.head import HeadModel
     from toonifygb.progress import Progress
     from toonifygb.structures import TrackedSequence
+    from toonifygb.track import NeckCuts
 
 FORMAT = "toonifygb-dataset"
 FRAMES, MATTES, FACTS = "frames.npy", "mattes.npy", "dataset.json"
@@ -60,6 +62,8 @@ class Dataset:
     split: Split
     fingerprint: str
     """Changes with everything the crops depend on."""
+    cuts: NeckCuts | None = None
+    """Where the neck ends in every crop; what lies below is not the head's."""
     reduction: int = 1
     """Targets are smaller than the stored crops by this whole factor."""
 
@@ -77,6 +81,12 @@ class Dataset:
         """The same frames seen smaller by a whole factor that divides their size; nothing is copied."""
         return replace(self, reduction=self.reduction * factor)
 
+    def cut_at(self, cuts: NeckCuts) -> Dataset:
+        """The same frames with the necks ending where a track has them end, px of the full frame."""
+        within = cuts.within(torch.from_numpy(self.boxes).float(), self.frames.shape[1])
+        digest = hashlib.sha256(torch.cat([within.normal, within.reach[:, None]], 1).numpy().tobytes()).hexdigest()
+        return replace(self, cuts=within, fingerprint=f"{self.fingerprint} {digest}")
+
     def camera(self, index: int) -> Camera:
         """Camera of one crop."""
         left, top, right, bottom = (float(edge) for edge in self.boxes[index])
@@ -85,6 +95,9 @@ class Dataset:
     def target(self, index: int) -> tuple[Float[Tensor, "s s 3"], Float[Tensor, "s s"]]:
         """What a render of this frame should be: colour × matte on black, 0..1, and the matte."""
         matte = torch.from_numpy(self.mattes[index].astype(np.float32)).div_(255)
+        if self.cuts is not None:
+            first, kept = self.cuts.rows(index, *matte.shape)
+            matte[first:] *= kept
         color = torch.from_numpy(self.frames[index].astype(np.float32)).div_(255).mul_(matte[..., None])
         if self.reduction == 1:
             return color, matte

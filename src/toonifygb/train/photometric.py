@@ -1,32 +1,29 @@
-"""Photometric tracking: the head's pose in every frame, fitted to the pixels of the clip.
+"""Photometric tracking: pose and expression of every frame, fitted to the pixels of the clip.
 
 Landmarks fix the face to about a pixel, but ears, hair and outline stand off the face, and the landmarks of a
 nodding head follow it only in part; a degree of rotation or a few millimetres of depth move the outline by pixels.
-So a small avatar that only the head model moves is trained on the training frames, and between its steps the pose
-of every frame takes a Gauss-Newton step towards its own picture, while the avatar grows sharper. Held-out frames
-follow the same rule as all others except that the avatar never learns from them, which is what photometric
-trackers of a whole clip do as well (3DGB's among them). Expressions stay those of the landmarks.
+So a small avatar that only the head model moves is trained on the training frames, and between its steps every
+frame takes a Gauss-Newton step towards its own picture, while the avatar grows sharper. Held-out frames follow the
+same rule as all others except that the avatar never learns from them, which is what photometric trackers of a whole
+clip do as well (3DGB's among them). The direction of gaze stays that of the landmarks.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
 
 from toonifygb import render
 from toonifygb.avatar import init_avatar
-from toonifygb.avatar.model import NECK, ROOT
+from toonifygb.avatar.fields import each, rows
+from toonifygb.avatar.model import JAW
 from toonifygb.config import TrainConfig
-from toonifygb.geometry.rotations import (
-    axis_angle_to_matrix,
-    matrix_to_axis_angle,
-    matrix_to_quat,
-    quat_multiply,
-)
 from toonifygb.progress import SILENT
 from toonifygb.threads import one_torch_thread
+from toonifygb.train.poses import RIGID, Poses, carried
 from toonifygb.train.state import TrainState
 from toonifygb.train.step import Stepper
 from toonifygb.train.views import TrainingViews
@@ -39,7 +36,7 @@ if TYPE_CHECKING:
     from toonifygb.head import HeadModel
     from toonifygb.progress import Progress
     from toonifygb.render import Renderer
-    from toonifygb.structures import Camera, Splats, TrackedSequence
+    from toonifygb.structures import Camera, Rendering, Splats, TrackedSequence
     from toonifygb.train.data import Dataset
 
 SIZE = 256
@@ -47,19 +44,27 @@ SIZE = 256
 STEPS = 700
 """Training steps of the small avatar."""
 PASSES = (200, 300, 400, 500, 600)
-"""Steps after which all poses are fitted; later passes move them by less than a tenth of a degree."""
-GAIN = 0.8
+"""Steps after which all frames are fitted; later passes move the heads by less than a tenth of a degree."""
+GAIN = 1.2
 """Share of a Gauss-Newton step that is taken: the curvature is a mean over frames."""
 CURVATURE_FRAMES = 8
 """Frames whose curvature is measured: that of an image in its pose hardly depends on which frame it is."""
-PRIOR = (0.05, 0.05, 0.05, 0.005, 0.005, 0.02)
+RIGID_PRIOR = (0.05, 0.05, 0.05, 0.005, 0.005, 0.02)
 """How far the landmark track may be off: rotation vector, rad, and translation, m; standard deviations."""
+JAW_PRIOR = (0.03, 0.01, 0.01)
+"""The same for the jaw's rotation vector, rad,"""
+EXPRESSION_PRIOR = 0.3
+"""for expression coefficients, in units of the head model's σ,"""
+EYELID_PRIOR = 0.2
+"""and for the lids."""
 CHIN = 152
 """Landmark at the tip of the chin."""
 NOISE = 0.1
 """Standard deviation of a pixel that the avatar cannot explain, 0..1."""
-DIFFERENCES = (4e-3, 4e-3, 4e-3, 4e-4, 4e-4, 2e-3)
-"""Finite differences for the curvature, same units; each moves the image by about half a pixel."""
+RIGID_DIFFERENCE = 0.08
+"""Finite differences, as shares of the prior: of the head's quantities, which move the image by half a pixel,"""
+FACE_DIFFERENCE = 0.3
+"""and of the face's, which move less of it."""
 
 
 def refine_track(
@@ -72,13 +77,13 @@ def refine_track(
     threads: int | None = None,
     progress: Progress = SILENT,
 ) -> TrackedSequence:
-    """The track with the rigid head pose of every frame of the split fitted to its pixels.
+    """The track with head pose, jaw, eyelids and expression of every frame of the split fitted to its pixels.
 
-    What all frames have in common (the whole clip turned or shifted in the head's own axes) belongs to the
-    avatar, not to the poses, and is left as the landmarks found it.
+    What all frames have in common (the whole clip turned, shifted in the head's own axes or smiling a little more)
+    belongs to the avatar, not to the frames, and is left as the landmarks found it.
 
     Args:
-        dataset: crops and mattes; the avatar is trained on ``split.train``, poses are fitted in both sets.
+        dataset: crops and mattes; the avatar is trained on ``split.train``, frames are fitted in both sets.
         sequence: the landmark track.
         head: its head model.
         seed: of the training.
@@ -103,80 +108,27 @@ def refine_track(
         state = TrainState.start(avatar, seed)
         stepper = Stepper(state, avatar, small, sequence, config, renderer, render.kernels(backend, threads))
         rigid = _above_chin(state, sequence, head)
-        twists = torch.zeros(sequence.n_frames, 6)
+        prior = _prior(avatar, head)
+        earlier = torch.zeros(sequence.n_frames, len(prior))
         while state.step < STEPS:
             stepper.step()
             done += 1
             progress.update(done, total, **figures)
             if state.step not in PASSES:
                 continue
-            poses = _Poses(avatar, sequence)
-            pivot = poses.pivot
-            curvature = _curvature(stepper, small, poses, frames, rigid, renderer)
-            changes = torch.zeros_like(twists)
+            poses = Poses(avatar, head, sequence)
+            look = _Look(stepper, small, poses, rigid, renderer)
+            curvature = look.curvature(frames, prior)
+            changes = torch.zeros_like(earlier)
             for index in frames.tolist():
-                slope = _slope(stepper.splats(index), pivot[index], small, index, rigid, renderer)
-                changes[index] = _newton(curvature, slope, twists[index], small.size)
+                changes[index] = _newton(curvature, look.slope(index), earlier[index], prior, small.size)
                 done += 1
                 progress.update(done, total, **figures)
-            changes = poses.without_common(changes, twists, frames)
-            sequence, twists = poses.moved(changes), twists + changes
+            changes = poses.without_common(changes, earlier, frames)
+            sequence, earlier = poses.moved(changes), earlier + changes
             stepper.follow(sequence)
             figures = {"turn_deg": float(torch.rad2deg(changes[frames, :3].norm(dim=-1)).mean())}
     return sequence
-
-
-@dataclass(frozen=True)
-class _Poses:
-    """The rigid poses of a clip's heads and what moving them needs."""
-
-    avatar: Avatar
-    sequence: TrackedSequence
-
-    @property
-    def pivot(self) -> Float[Tensor, "t 3"]:
-        """Middle of the eyes in the world, m: turning about it hardly moves what the landmarks have fixed."""
-        eyes = self.avatar.transforms(self.sequence.motion)[:, 3:, :3]
-        rest = self.avatar.rest_joints[3:]
-        return (torch.einsum("tjab,jb->tja", eyes[..., :3], rest) + eyes[..., 3]).mean(1)
-
-    @property
-    def rotation(self) -> Float[Tensor, "t 3 3"]:
-        """Head to world: the root's turn, then the neck's."""
-        turns = axis_angle_to_matrix(self.sequence.motion.joints[:, : NECK + 1])
-        return turns[:, ROOT] @ turns[:, NECK]
-
-    def without_common(
-        self, changes: Float[Tensor, "t 6"], twists: Float[Tensor, "t 6"], frames: Int[Tensor, " n"]
-    ) -> Float[Tensor, "t 6"]:
-        """Changes after which the twists have no mean in the head's axes.
-
-        Args:
-            changes: about to be made, world axes.
-            twists: made since the landmark track.
-            frames: those that count and change.
-        """
-        turn = self.rotation[frames]
-        both = (changes + twists)[frames].view(-1, 2, 3)
-        common = torch.einsum("nba,nkb->nka", turn, both).mean(0)
-        left = changes.clone()
-        left[frames] -= torch.einsum("nab,kb->nka", turn, common).flatten(1)
-        return left
-
-    def moved(self, twists: Float[Tensor, "t 6"]) -> TrackedSequence:
-        """The track with every head turned about its pivot by a rotation vector, then shifted, world axes."""
-        motion, pivot = self.sequence.motion, self.pivot
-        turn = axis_angle_to_matrix(twists[:, :3])
-        body = axis_angle_to_matrix(motion.joints[:, ROOT])
-        joints = motion.joints.clone()
-        joints[:, NECK] = matrix_to_axis_angle(body.mT @ turn @ self.rotation)
-        # The head hangs on the neck joint: the body goes where that joint has to go.
-        placed = self.avatar.transforms(motion)[:, ROOT]
-        rest = self.avatar.rest_joints[NECK] + motion.expression @ self.avatar.joint_expression_basis[NECK].T
-        neck = torch.einsum("tab,tb->ta", placed[:, :3, :3], rest) + placed[:, :3, 3]
-        arm = neck - pivot
-        translation = motion.translation + torch.einsum("tab,tb->ta", turn, arm) - arm + twists[:, 3:]
-        return replace(self.sequence, motion=replace(motion, joints=joints, translation=translation))
 
 
 def _above_chin(state: TrainState, sequence: TrackedSequence, head: HeadModel) -> Bool[Tensor, " n"]:
@@ -185,76 +137,91 @@ def _above_chin(state: TrainState, sequence: TrackedSequence, head: HeadModel) -
     return state.neutral.values.means[:, 1] > chin
 
 
+def _prior(avatar: Avatar, head: HeadModel) -> Float[Tensor, " c"]:
+    """How far the landmark track may be off in each quantity of a change, standard deviations."""
+    units = EXPRESSION_PRIOR * head.expression_sigma[: avatar.n_expressions]
+    lids = units.new_full((avatar.n_eyelids,), EYELID_PRIOR)
+    return torch.cat([units.new_tensor(RIGID_PRIOR + JAW_PRIOR), units, lids])
+
+
 def _newton(
-    curvature: Float[Tensor, "6 6"], slope: Float[Tensor, " 6"], twist: Float[Tensor, " 6"], size: int
-) -> Float[Tensor, " 6"]:
-    """Damped step of one frame's pose; images of ``size`` px hold about so many independent witnesses."""
-    weight, precision = 1 / (NOISE**2 * size), torch.tensor(PRIOR) ** -2
+    curvature: Float[Tensor, "c c"],
+    slope: Float[Tensor, " c"],
+    earlier: Float[Tensor, " c"],
+    prior: Float[Tensor, " c"],
+    size: int,
+) -> Float[Tensor, " c"]:
+    """Damped step of one frame; images of ``size`` px hold about so many independent witnesses."""
+    weight, precision = 1 / (NOISE**2 * size), prior**-2
     system = weight * curvature + torch.diag(precision)
-    return -GAIN * torch.linalg.solve(system, weight * slope + precision * twist)
+    return -GAIN * torch.linalg.solve(system, weight * slope + precision * earlier)
 
 
-def _slope(
-    splats: Splats,
-    pivot: Float[Tensor, " 3"],
-    dataset: Dataset,
-    index: int,
-    rigid: Bool[Tensor, " n"],
-    renderer: Renderer,
-) -> Float[Tensor, " 6"]:
-    """Half the derivative of the squared image error by the pose, as the Gaussians' positions carry it."""
-    means = splats.means.detach().requires_grad_()
-    shown = renderer.render(replace(splats, means=means), dataset.camera(index))
-    color, matte = dataset.target(index)
-    errors = [(shown.color - color).detach(), (shown.alpha - matte).detach()]
-    (pull,) = torch.autograd.grad([shown.color, shown.alpha], [means], errors)
-    arm, pull = (means.detach() - pivot)[rigid], pull[rigid]
-    return torch.cat([torch.linalg.cross(arm, pull).sum(0), pull.sum(0)])
+@dataclass(frozen=True)
+class _Look:
+    """How the pictures of the avatar, as it stands now, answer to changes of pose and expression."""
+
+    stepper: Stepper
+    dataset: Dataset
+    poses: Poses
+    rigid: Bool[Tensor, " n"]
+    """Gaussians that turn with the head."""
+    renderer: Renderer
+
+    def slope(self, index: int) -> Float[Tensor, " c"]:
+        """Half the derivative of one frame's squared image error by a change, to first order."""
+        pull = self.stepper.pull(index, _errors)
+        means, forces = pull.splats.means, pull.world.means
+        arm, force = (means - self._pivot[index])[self.rigid], forces[self.rigid]
+        lever = self.stepper.state.skin_weights[:, JAW, None] * (means - self._jaw[index])
+        torque = torch.linalg.cross(lever, forces).sum(0)
+        blend = torch.zeros(self.poses.width - RIGID - 3)
+        for name, delta in each(self.stepper.state.expression.values):
+            matrix = rows(delta)
+            blend += matrix @ getattr(pull.raw, name).reshape(-1)[: matrix.shape[1]]
+        turn = torch.linalg.cross(arm, force).sum(0)
+        return torch.cat([turn, force.sum(0), self._rotation[index].mT @ torque, blend])
+
+    def curvature(self, frames: Int[Tensor, " n"], prior: Float[Tensor, " c"]) -> Float[Tensor, "c c"]:
+        """Mean Gauss-Newton matrix of the squared image error, over frames spread evenly."""
+        spread = torch.linspace(0, len(frames) - 1, min(CURVATURE_FRAMES, len(frames))).round().long()
+        total = torch.zeros(len(prior), len(prior))
+        with torch.no_grad():
+            for index in frames[spread].tolist():
+                jacobian = self._jacobian(index, prior)
+                total += jacobian @ jacobian.T
+        return total / len(spread)
+
+    def _jacobian(self, index: int, prior: Float[Tensor, " c"]) -> Float[Tensor, "c p"]:
+        """Derivative of all pixels of one frame by a change, by finite differences."""
+        camera, splats = self.dataset.camera(index), self.stepper.splats(index)
+        still = _pixels(splats, camera, self.renderer)
+        heads, faces = torch.diag(RIGID_DIFFERENCE * prior[:RIGID]), torch.diag(FACE_DIFFERENCE * prior)[RIGID:]
+        moved = [carried(splats, head, self._pivot[index], self.rigid) for head in heads]
+        changed = self.poses.faces(index, faces)
+        moved += [self.stepper.splats_of(changed[number]) for number in range(len(faces))]
+        steps = torch.cat([heads.sum(1), faces.sum(1)])
+        return torch.stack([_pixels(one, camera, self.renderer).sub_(still) for one in moved]) / steps[:, None]
+
+    @cached_property
+    def _pivot(self) -> Float[Tensor, "t 3"]:
+        return self.poses.pivot
+
+    @cached_property
+    def _jaw(self) -> Float[Tensor, "t 3"]:
+        return self.poses.jaw
+
+    @cached_property
+    def _rotation(self) -> Float[Tensor, "t 3 3"]:
+        return self.poses.rotation
 
 
-def _curvature(
-    stepper: Stepper,
-    dataset: Dataset,
-    poses: _Poses,
-    frames: Int[Tensor, " n"],
-    rigid: Bool[Tensor, " n"],
-    renderer: Renderer,
-) -> Float[Tensor, "6 6"]:
-    """Mean Gauss-Newton matrix of the squared image error in the pose, over frames spread evenly."""
-    spread = torch.linspace(0, len(frames) - 1, min(CURVATURE_FRAMES, len(frames))).round().long()
-    pivot = poses.pivot
-    total = torch.zeros(6, 6)
-    with torch.no_grad():
-        for index in frames[spread].tolist():
-            splats, camera = stepper.splats(index), dataset.camera(index)
-            still = _pixels(splats, camera, renderer)
-            jacobian = torch.stack(
-                [
-                    (_pixels(carried(splats, row, pivot[index], rigid), camera, renderer) - still) / row.sum()
-                    for row in torch.diag(torch.tensor(DIFFERENCES))
-                ]
-            )
-            total += jacobian @ jacobian.T
-    return total / len(spread)
+def _errors(shown: Rendering, color: Tensor, matte: Tensor) -> tuple[Tensor, Tensor]:
+    """Half the derivative of the squared error by colour and opacity."""
+    return (shown.color - color).detach(), (shown.alpha - matte).detach()
 
 
 def _pixels(splats: Splats, camera: Camera, renderer: Renderer) -> Float[Tensor, " p"]:
     """Colour and opacity of a rendering, flat."""
     shown = renderer.render(splats, camera)
     return torch.cat([shown.color.flatten(), shown.alpha.flatten()])
-
-
-def carried(
-    splats: Splats, twist: Float[Tensor, " 6"], pivot: Float[Tensor, " 3"], which: Bool[Tensor, " n"]
-) -> Splats:
-    """Splats of which some are turned about the pivot by a rotation vector, then shifted."""
-    rotation = axis_angle_to_matrix(twist[:3])
-    turn = matrix_to_quat(rotation).expand_as(splats.quats)
-    some = which[:, None]
-    frames = splats.sh_frames
-    return replace(
-        splats,
-        means=torch.where(some, (splats.means - pivot) @ rotation.T + pivot + twist[3:], splats.means),
-        quats=torch.where(some, quat_multiply(turn, splats.quats), splats.quats),
-        sh_frames=None if frames is None else torch.where(some[..., None], rotation @ frames, frames),
-    )

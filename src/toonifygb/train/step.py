@@ -6,6 +6,8 @@ allocates little and its work stays in the fused kernels. ``tests/train`` holds 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -14,22 +16,50 @@ from toonifygb.avatar import MouthVolume
 from toonifygb.avatar.fields import cut, join
 from toonifygb.avatar.skinning import pose_offsets
 from toonifygb.render import RenderInfo
-from toonifygb.structures import GaussianParams, Splats
+from toonifygb.structures import GaussianParams, Rendering, Splats
 from toonifygb.train.losses import LossTerms, LossWeights, image_gradients, mouth_loss
 from toonifygb.train.optim import Coefficients, Optimizer, blend
 from toonifygb.train.state import Counts
 
 if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
     from toonifygb.avatar import Avatar
     from toonifygb.config import TrainConfig
     from toonifygb.render import Renderer
     from toonifygb.render.fused import Kernels
-    from toonifygb.structures import TrackedSequence
+    from toonifygb.structures import HeadMotion, TrackedSequence
     from toonifygb.train.data import Dataset
     from toonifygb.train.state import TrainState
 
 SH_GROWTH = 40
 """The active SH degree rises by one after every this-many-th part of the steps, from 0."""
+
+
+ImageErrors = Callable[[Rendering, "Tensor", "Tensor"], "tuple[Tensor, Tensor]"]
+"""Rendering, colours and matte of a frame → derivatives by the rendering's colour and opacity."""
+
+
+@dataclass(frozen=True)
+class Pull:
+    """Derivatives of some loss of one frame's picture."""
+
+    splats: Splats
+    """The Gaussians of that frame in the world."""
+    world: Splats
+    """By those."""
+    raw: GaussianParams
+    """By the blended raw parameters, which are those of the neutral, and times ψk those of ΔBk."""
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """What a motion says to the Gaussians."""
+
+    psi: Coefficients
+    features: Float[Tensor, " p"]
+    transforms: Float[Tensor, "5 4 4"]
 
 
 class Stepper:
@@ -92,35 +122,73 @@ class Stepper:
         index = state.next_frame(self._dataset.split.train)
         state.step += 1
         gradient, terms = self._gradient(index, info)
-        self._optimizer.step(state, gradient, self._coefficients(index))
+        self._optimizer.step(state, gradient, self._frame(index).psi)
         return terms
 
     def splats(self, index: int) -> Splats:
         """All Gaussians as they stand now, in the pose of one frame, world space."""
-        return self._posed(index)[1]
+        return self._posed(self._frame(index))[1]
 
-    def _coefficients(self, index: int) -> Coefficients:
-        return Coefficients(self._expression[index], self._driver[index])
+    def splats_of(self, motion: HeadMotion) -> Splats:
+        """The same for any motion, no batch axis."""
+        return self._posed(self._motion(motion))[1]
 
-    def _posed(self, index: int) -> tuple[GaussianParams, Splats]:
-        """Blended raw parameters of one frame, and the splats they become."""
-        raw = blend(self.state, self._coefficients(index), self._kernels)
-        raw.means[: self.state.counts.face].add_(pose_offsets(self._features[index], self.state.pose_basis))
-        return raw, self._kernels.skin(raw, self.state.skin_weights, self._transforms[index])
+    def pull(self, index: int, errors: ImageErrors, info: RenderInfo | None = None) -> Pull:
+        """How errors of one frame's picture pull at the Gaussians.
 
-    def _gradient(self, index: int, info: RenderInfo | None) -> tuple[GaussianParams, LossTerms]:
-        """Gradient of the whole objective for the blended raw parameters of one frame."""
-        raw, splats = self._posed(index)
+        Args:
+            index: frame number.
+            errors: the rendering, colours and matte of the frame → derivatives of some loss by the rendering's
+                colour and opacity.
+            info: filled with the densification statistic when given.
+        """
+        frame = self._frame(index)
+        raw, splats = self._posed(frame)
         leaves = _leaves(splats)
         cut_off = Splats(*leaves, sh_frames=splats.sh_frames)
         camera = self._dataset.camera(index)
         rendering = self._renderer.render(cut_off, camera, sh_degree=self.sh_degree, info=info)
-        target, matte = self._dataset.target(index)
-        photo, alpha, v_color, v_alpha = image_gradients(rendering, target, matte, self._weights, self._kernels)
-        found = torch.autograd.grad([rendering.color, rendering.alpha], leaves, [v_color, v_alpha])
-        binding = (self.state.skin_weights, self._transforms[index])
-        gradient = self._kernels.skin_gradient(raw, *binding, Splats(*found))
-        return gradient, LossTerms(photo, alpha, self._add_mouth_gradient(gradient))
+        slopes = errors(rendering, *self._dataset.target(index))
+        world = Splats(*torch.autograd.grad([rendering.color, rendering.alpha], leaves, slopes))
+        return Pull(
+            splats, world, self._kernels.skin_gradient(raw, self.state.skin_weights, frame.transforms, world)
+        )
+
+    def _frame(self, index: int) -> _Frame:
+        return _Frame(
+            Coefficients(self._expression[index], self._driver[index]),
+            self._features[index],
+            self._transforms[index],
+        )
+
+    def _motion(self, motion: HeadMotion) -> _Frame:
+        psi = self._template.coefficients(motion)
+        n = self._expression.shape[-1]
+        return _Frame(
+            Coefficients(psi[:n], psi[n:]),
+            self._template.pose_feature(motion),
+            self._template.transforms(motion),
+        )
+
+    def _posed(self, frame: _Frame) -> tuple[GaussianParams, Splats]:
+        """Blended raw parameters of one frame, and the splats they become."""
+        raw = blend(self.state, frame.psi, self._kernels)
+        raw.means[: self.state.counts.face].add_(pose_offsets(frame.features, self.state.pose_basis))
+        return raw, self._kernels.skin(raw, self.state.skin_weights, frame.transforms)
+
+    def _gradient(self, index: int, info: RenderInfo | None) -> tuple[GaussianParams, LossTerms]:
+        """Gradient of the whole objective for the blended raw parameters of one frame."""
+        terms = LossTerms(0.0, 0.0, 0.0)
+
+        def errors(rendering: Rendering, target: Tensor, matte: Tensor) -> tuple[Tensor, Tensor]:
+            terms.photo, terms.alpha, v_color, v_alpha = image_gradients(
+                rendering, target, matte, self._weights, self._kernels
+            )
+            return v_color, v_alpha
+
+        gradient = self.pull(index, errors, info).raw
+        terms.mouth = self._add_mouth_gradient(gradient)
+        return gradient, terms
 
     def _add_mouth_gradient(self, gradient: GaussianParams) -> float:
         """Adds the mouth penalty's gradient in place; returns the penalty."""

@@ -1,0 +1,87 @@
+"""Deltas in a tenth of the room: only those that change something, in the fewest bits that do not show.
+
+A blendshape of a local unit moves a part of the face, so most (Gaussian, k) pairs are exactly zero: a bit per pair
+says which live, and only their values are kept. Positions are half floats, everything else is a signed byte times a
+step of its own for every (blendshape, channel): the step is the largest value over 127.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from toonifygb.avatar.fields import FIELDS, each
+from toonifygb.structures import GaussianParams
+
+if TYPE_CHECKING:
+    from jaxtyping import UInt8
+    from torch import Tensor
+
+HALF = ("means",)
+"""Fields kept as half floats: a byte would move the corners of a smile in visible steps."""
+LEVELS = 127
+_SHAPES = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": (), "sh": (-1, 3)}
+_BITS = 8
+
+
+def pack(deltas: GaussianParams) -> dict[str, Tensor]:
+    """Tensors ``FIELD.live`` (bits), ``FIELD.values`` (pairs, channels) and ``FIELD.steps`` (K, channels).
+
+    Args:
+        deltas: of K blendshapes and n Gaussians.
+    """
+    packed = {}
+    for name, delta in each(deltas):
+        values = delta.reshape(*delta.shape[:2], -1)
+        live = (values != 0).any(-1)
+        packed[f"{name}.live"] = _bits(live)
+        if name in HALF:
+            packed[f"{name}.values"] = values[live].half()
+            continue
+        steps = values.abs().amax(1) / LEVELS
+        levels = (values / steps.clamp_min(torch.finfo(steps.dtype).tiny)[:, None]).round()
+        packed[f"{name}.steps"] = steps
+        packed[f"{name}.values"] = levels[live].to(torch.int8)
+    return packed
+
+
+def unpack(packed: dict[str, Tensor], n: int) -> GaussianParams:
+    """The deltas that ``pack`` was given, to half a step.
+
+    Args:
+        packed: its tensors.
+        n: Gaussians.
+
+    Raises:
+        ValueError: the tensors do not fit together.
+    """
+    deltas = {}
+    for name in FIELDS:
+        live, values = _truth(packed[f"{name}.live"], n), packed[f"{name}.values"]
+        dense = torch.zeros(*live.shape, values.shape[-1])
+        if int(live.sum()) != len(values):
+            raise ValueError(f"{name} has {len(values)} values for {int(live.sum())} pairs")
+        dense[live] = values.float()
+        if name not in HALF:
+            dense *= packed[f"{name}.steps"][:, None]
+        deltas[name] = dense.view(*live.shape, *_SHAPES[name])
+    return GaussianParams(**deltas)
+
+
+def names() -> set[str]:
+    """Names of all tensors of a packed set."""
+    kinds = {name: ("live", "values") if name in HALF else ("live", "values", "steps") for name in FIELDS}
+    return {f"{name}.{kind}" for name, parts in kinds.items() for kind in parts}
+
+
+def _bits(live: Tensor) -> UInt8[Tensor, "k b"]:
+    """Truth values, eight to the byte, the first in the lowest bit."""
+    padded = torch.nn.functional.pad(live.to(torch.uint8), (0, -live.shape[1] % _BITS))
+    return (padded.view(len(live), -1, _BITS) << torch.arange(_BITS, dtype=torch.uint8)).sum(-1, dtype=torch.uint8)
+
+
+def _truth(bits: UInt8[Tensor, "k b"], n: int) -> Tensor:
+    """The first ``n`` truth values of each row of ``_bits``."""
+    apart = (bits[..., None] >> torch.arange(_BITS, dtype=torch.uint8)) & 1
+    return apart.flatten(1)[:, :n].bool()
