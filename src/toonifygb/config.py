@@ -156,7 +156,7 @@ class StyleTrainConfig:
     generator_batch: int = 4
     """Pictures a step of the first stage."""
     generator_rate: float = 0.002
-    """Learning rate of the generator, and of the discriminator in both stages."""
+    """Learning rate of the generator and the discriminator in the first stage."""
     r1_weight: float = 10.0
     """Weight of the discriminator's squared gradient at real pictures in the first stage."""
     path_weight: float = 0.0
@@ -180,7 +180,7 @@ class StyleTrainConfig:
     encoder_batch: int = 2
     """Pairs a step of the second stage."""
     encoder_rate: float = 0.0001
-    """Learning rate of the encoder."""
+    """Learning rate of the encoder and the discriminator in the second stage."""
     truncation: float = 1.0
     """Codes of the pairs: as drawn (1), the average face (0), or between."""
     l2_weight: float = 1.0

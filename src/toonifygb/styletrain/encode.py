@@ -72,7 +72,7 @@ class Encode:
         self.discriminator = copy.deepcopy(discriminator).requires_grad_(True)
         network.encoder.requires_grad_(True)
         self.optimizer = Ranger(network.encoder.parameters(), config.encoder_rate)
-        self.discriminator_optimizer = discriminator_adam(self.discriminator, config)
+        self.discriminator_optimizer = discriminator_adam(self.discriminator, config.encoder_rate)
 
     def step(self, step: int) -> dict[str, float]:
         """One step; ``step`` counts from 0. Draws from torch's global random state.

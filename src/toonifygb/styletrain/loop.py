@@ -48,8 +48,8 @@ if TYPE_CHECKING:
     from toonifygb.stylize.styleganex.generator import Generator
 
 SUFFIX = ".safetensors"
-_SMOOTHING = 0.05
-"""Share of a step in the losses that are shown."""
+_RECENT = 50
+"""Steps over which the losses that are shown are averaged, about."""
 _COUNTS = ("generator_steps", "generator_batch", "ada_images", "ema_images", "encoder_steps", "encoder_batch")
 _COUNTS += ("preview_steps",)
 """Settings that count something."""
@@ -193,14 +193,13 @@ class _Runner:
             return
         progress = self.reporter.stage(plan.name, plan.title)
         figures: dict[str, float] = {}
+        seen: dict[str, int] = {}
         saved = time.monotonic()
         try:
             while step < plan.n_steps:
-                latest = self._step(stage, plan, step)
-                figures |= {
-                    key: value + (1 - _SMOOTHING) * (figures.get(key, value) - value)
-                    for key, value in latest.items()
-                }
+                for key, value in self._step(stage, plan, step).items():
+                    seen[key] = seen.get(key, 0) + 1
+                    figures[key] = figures.get(key, 0.0) + (value - figures.get(key, 0.0)) / min(seen[key], _RECENT)
                 step += 1
                 if step % self.config.preview_steps == 0 or step == plan.n_steps:
                     self._preview(plan, step, figures)

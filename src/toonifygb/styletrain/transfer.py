@@ -67,7 +67,7 @@ class Transfer:
         trained = [parameter for parameter in self.generator.parameters() if parameter.requires_grad]
         lazy = PATH_EVERY / (PATH_EVERY + 1) if config.path_weight else 1.0
         self.generator_optimizer = adam(trained, config.generator_rate, lazy)
-        self.discriminator_optimizer = discriminator_adam(discriminator, config)
+        self.discriminator_optimizer = discriminator_adam(discriminator, config.generator_rate)
 
     def step(self, step: int) -> dict[str, float]:
         """One step of both players; ``step`` counts from 0. Draws from torch's global random state.
@@ -171,9 +171,9 @@ def adam(parameters: list[nn.Parameter], rate: float, lazy: float) -> torch.opti
     return torch.optim.Adam(parameters, lr=rate * lazy, betas=(0.0, 0.99**lazy))
 
 
-def discriminator_adam(discriminator: Discriminator, config: StyleTrainConfig) -> torch.optim.Adam:
+def discriminator_adam(discriminator: Discriminator, rate: float) -> torch.optim.Adam:
     """The discriminator's optimiser, in both stages."""
-    return adam(list(discriminator.parameters()), config.generator_rate, R1_EVERY / (R1_EVERY + 1))
+    return adam(list(discriminator.parameters()), rate, R1_EVERY / (R1_EVERY + 1))
 
 
 def judge(
