@@ -25,7 +25,7 @@ FLOORS = {
     1: ("geometry", "metrics", "assets", "config"),
     2: ("video", "face", "head", "stylize", "render"),
     3: ("avatar", "track", "synthetic", "datasets"),
-    4: ("train", "drive"),
+    4: ("train", "drive", "styletrain"),
     5: ("evaluate", "viewer"),
     6: ("pipeline",),
     7: ("batch",),

@@ -11,6 +11,7 @@ import dataclasses
 import difflib
 import json
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from toonifygb.errors import InputError
@@ -26,15 +27,15 @@ class StylizeConfig:
     """Stage 1: how each frame is stylised."""
 
     style: str = "toon"
-    """toon, paint, ink or none; a style with weights of its own (arcane, cartoon, pixar); or a model file, .onnx
-    or .ts."""
+    """toon, paint, ink or none; a style with weights of its own (arcane, cartoon, pixar, age, hair); or a file: a
+    model, .onnx or .ts, or a style that was trained, .safetensors."""
     strength: float = 1.0
     """Blend between the original (0) and the full style (1)."""
 
 
 @dataclass(frozen=True)
 class StyleganexConfig:
-    """The styles that run StyleGANEX: arcane, cartoon, pixar."""
+    """The styles that run StyleGANEX: arcane, cartoon, pixar, age, hair, and those that were trained."""
 
     framing: Framing = "auto"
     """What goes through the network: full (the whole frame), crop (the surroundings of the face, blended into the
@@ -53,6 +54,8 @@ class StyleganexConfig:
     """Take sensor noise out of the source first, which keeps the result from boiling."""
     rounding: Literal["nearest", "truncate"] = "nearest"
     """How the network's colours become bytes; truncate is the authors' and darkens by half a level."""
+    edit: float = 1.0
+    """How far the styles age and hair go; below 0 they go the other way."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """bfloat16 is about twice as fast on processors that multiply in it, and differs by half a level on average."""
     levels: int = 8
@@ -136,6 +139,74 @@ class TrainConfig:
     """Most frames held out."""
     seed: int = 0
     """Seed of every random choice."""
+
+
+@dataclass(frozen=True)
+class StyleTrainConfig:
+    """Teaching StyleGANEX a style of one's own: first a generator from pictures, then an encoder from pairs."""
+
+    resolution: Literal[256, 512, 1024] = 1024
+    """Side of the pictures that are learnt from, px; frames stylised with fewer than 8 levels need no more."""
+    aligned: bool = False
+    """The pictures are squares aligned like FFHQ's already: take them as they are, without looking for faces."""
+    mirror: bool = True
+    """Learn from every picture's mirror image, too."""
+    generator_steps: int = 3_000
+    """Steps of the first stage, the transfer of the generator to the pictures."""
+    generator_batch: int = 4
+    """Pictures a step of the first stage."""
+    generator_rate: float = 0.002
+    """Learning rate of the generator and the discriminator in the first stage."""
+    r1_weight: float = 10.0
+    """Weight of the discriminator's squared gradient at real pictures in the first stage."""
+    path_weight: float = 0.0
+    """Weight of path-length regularisation, 2 in StyleGAN2; off because it ties the generator to its old faces."""
+    mixing: float = 0.9
+    """Share of the first stage's images drawn from two codes, one for the coarse layers, one for the fine ones."""
+    ada_target: float = 0.6
+    """Adaptive augmentation keeps the mean sign of the discriminator's answers to real pictures at this."""
+    ada_images: int = 100_000
+    """Real pictures shown while the probability of augmentations goes from 0 to 1 at the most."""
+    ema_images: int = 10_000
+    """Real pictures over which the averaged generator forgets half, at the most; at first it is quicker."""
+    swap: Literal["none", "shape", "texture"] = "none"
+    """What comes from the pictures: none (nothing is swapped: everything does), shape (their layers up to
+    swap_size, the base's colours and skin beyond), or texture (the base's faces up to swap_size, their colours and
+    strokes beyond)."""
+    swap_size: int = 32
+    """Nominal size of the last swapped layers, px: 4, 8, 16, ... 512."""
+    encoder_steps: int = 55_000
+    """Steps of the second stage, the encoder and fusion layers."""
+    encoder_batch: int = 2
+    """Pairs a step of the second stage."""
+    encoder_rate: float = 0.0001
+    """Learning rate of the encoder and the discriminator in the second stage."""
+    truncation: float = 1.0
+    """Codes of the pairs: as drawn (1), the average face (0), or between."""
+    l2_weight: float = 1.0
+    """Weight of the mean squared colour difference."""
+    perceptual_weight: float = 0.8
+    """Weight of the perceptual distance: LPIPS where its weights are given, else of discriminator features."""
+    adversarial_weight: float = 0.1
+    """Weight of the discriminator's opinion in the second stage."""
+    encoder_r1_weight: float = 1.0
+    """Weight of the discriminator's squared gradient in the second stage."""
+    flicker_weight: float = 30.0
+    """Weight of the difference between a moved input's output and the moved output; grows from 0 in the second
+    half of the second stage."""
+    lpips: Path | None = None
+    """Weights of LPIPS on AlexNet: torch.save(lpips.LPIPS(net="alex").state_dict(), FILE) writes them."""
+    checkpoint_seconds: float = 600.0
+    """Time between checkpoints, which take up to 5 GB beside the style."""
+    preview_steps: int = 250
+    """Steps between two pictures of what has been learnt."""
+    seed: int = 0
+    """Seed of every random choice."""
+    device: str = "auto"
+    """Where it runs: cpu, cuda, or auto (cuda where there is one)."""
+
+
+STYLE_TRAIN = StyleTrainConfig()
 
 
 @dataclass(frozen=True)

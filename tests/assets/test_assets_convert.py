@@ -161,6 +161,52 @@ def doubling_lists(folder: Path) -> Path:
     return saved(folder, {"state_dict": {}, "opts": {"x": value}})
 
 
+NESTED = b"N\x85" + b"2\x86" * 60
+"""A tuple of the same tuple twice, 60 times: 124 bytes that take 2^60 steps to hash."""
+
+
+def nested_key(folder: Path) -> Path:
+    return with_program(folder, program(b"}", NESTED, b"Ns"))
+
+
+def nested_keys(folder: Path) -> Path:
+    """The key lies in the memo when the dict is filled."""
+    return with_program(folder, program(NESTED, b"q\x010}(h\x01Nu"))
+
+
+def nested_key_of_an_ordered_dict(folder: Path) -> Path:
+    return with_program(folder, program(b"ccollections\nOrderedDict\n]", NESTED, b"N\x86a\x85R"))
+
+
+def nested_member(folder: Path) -> Path:
+    return with_program(folder, b"\x80\x04\x8f(" + NESTED + b"\x90.")
+
+
+def nested_kind_of_storage(folder: Path) -> Path:
+    return with_program(folder, program(b"(X\x07\x00\x00\x00storage", NESTED, b"X\x01\x00\x00\x000NK\x04tQ"))
+
+
+def nested_kind_of_number(folder: Path) -> Path:
+    kind = b"cnumpy\ndtype\n" + NESTED + b"\x85R"
+    return with_program(folder, program(b"cnumpy._core.multiarray\nscalar\n", kind, b"C\x00\x86R"))
+
+
+def called_key(folder: Path) -> Path:
+    """The answer of a permitted function, which is not known before it is called."""
+    return with_program(folder, program(b"}ctorch\nSize\n", NESTED, b"\x85RNs"))
+
+
+def numbers_beyond_counting(folder: Path) -> Path:
+    """A size of a million bytes."""
+    path = saved(folder, {"state_dict": {"a": torch.ones(4)}})
+    large = b"\x8b" + struct.pack("<i", 2**20) + b"\x7f" * 2**20
+
+    def grow(name: str, content: bytes) -> bytes:
+        return content.replace(b"K\x04\x85", large + b"\x85") if name.endswith("data.pkl") else content
+
+    return rewrite(path, grow)
+
+
 def huge_tensor(folder: Path) -> Path:
     """A gigabyte claimed for a storage of 16 bytes."""
     path = saved(folder, {"state_dict": {"a": torch.ones(4)}})
@@ -274,6 +320,14 @@ CASES: dict[Callable[[Path], Path], str] = {
     changed_tensor: r"tries to change an object",
     memo_bomb: r"numbers its objects",
     doubling_lists: r"more values",
+    nested_key: r"keys that are neither text nor whole numbers",
+    nested_keys: r"keys that are neither text nor whole numbers",
+    nested_key_of_an_ordered_dict: r"keys that are neither text nor whole numbers",
+    nested_member: r"keys that are neither text nor whole numbers",
+    nested_kind_of_storage: r"refers to something other than numbers",
+    nested_kind_of_number: r"has no kind",
+    called_key: r"keys that are neither text nor whole numbers",
+    numbers_beyond_counting: "sizes that are no counts",
     huge_tensor: r"claims shape \[268435456\] but its storage has 4 numbers",
     huge_storage: r"16 bytes for 268435456 numbers",
     expanded_tensor: r"claims shape \[1048576, 1048576\]",

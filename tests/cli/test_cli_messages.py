@@ -104,6 +104,21 @@ def run_is_absent(folder: Path) -> list[str]:
     return ["train", str(folder / "nowhere")]
 
 
+def style_of_three_pictures(folder: Path) -> list[str]:
+    (folder / "drawings").mkdir()
+    for index in range(3):
+        video.save_png(folder / "drawings" / f"{index}.png", pattern((64, 64), index))
+    style = str(folder / "style.safetensors")
+    return ["style", "train", "--images", str(folder / "drawings"), "--base", "nothing.pt", "--out", style]
+
+
+def style_from_nowhere(folder: Path) -> list[str]:
+    arguments = style_of_three_pictures(folder)
+    for index in range(3, 6):
+        video.save_png(folder / "drawings" / f"{index}.png", pattern((64, 64), index))
+    return arguments
+
+
 CASES: dict[str, Callable[[Path], list[str]]] = {
     case.__name__: case
     for case in (
@@ -120,6 +135,8 @@ CASES: dict[str, Callable[[Path], list[str]]] = {
         stylized_is_not_mp4,
         avatar_is_absent,
         run_is_absent,
+        style_of_three_pictures,
+        style_from_nowhere,
     )
 }
 

@@ -17,6 +17,7 @@ class FakeNetwork(torch.nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("latent_avg", torch.full((18, 512), 0.25))
+        self.register_buffer("editing_w", torch.zeros(0, 18, 512))
         self.faces = 0
 
     def codes(self, x2: torch.Tensor) -> torch.Tensor:

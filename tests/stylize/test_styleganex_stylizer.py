@@ -16,9 +16,9 @@ from styleganex_weights import NARROW, make_network
 
 from toonifygb import stylize
 from toonifygb.config import PUBLISHED_STYLEGANEX, StyleganexConfig
-from toonifygb.errors import FaceError, InputError
+from toonifygb.errors import AssetError, FaceError, InputError
 from toonifygb.stylize.filters import to_lab
-from toonifygb.stylize.styleganex import PUBLISHED, weights
+from toonifygb.stylize.styleganex import PUBLISHED, fast, weights
 from toonifygb.stylize.styleganex.aligned import AlignedStylizer
 from toonifygb.stylize.styleganex.engine import Engine, to_bytes, to_network
 from toonifygb.stylize.styleganex.frame import CropRule, crop_rule
@@ -231,7 +231,7 @@ def test_source_color_returns() -> None:
     assert np.array_equal(keep_color(drawn, frame, 0.0, 10.0), drawn)
 
 
-@pytest.mark.parametrize("name", ["arcane", "cartoon", "pixar"])
+@pytest.mark.parametrize("name", ["arcane", "cartoon", "pixar", "age", "hair"])
 def test_without_weights_it_is_said_how_to_get_them(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -277,3 +277,30 @@ def test_the_real_network_runs_by_name(framing: str, tmp_path: Path, monkeypatch
     again = stylize.stylize_frames(iter(frames), marks, stylize.get("arcane", options), state, chunk=1, start=2)
     assert np.array_equal(next(again), whole[2])
     assert stylize.files("arcane") == (models / "styleganex-arcane.safetensors",)
+
+
+@pytest.mark.parametrize("amount", [1.0, -0.5])
+def test_editing_styles_go_as_far_as_asked(amount: float) -> None:
+    """Codes and attention follow the first editing vector, as in the definition."""
+    network = make_network(dataclasses.replace(PUBLISHED["edit"], width=NARROW))
+    network.editing_w = torch.cat((network.editing_w, 9 * network.editing_w))
+    frame = scene.frames(1, 64, 48)[0][None]
+    codes = network.latent_avg + 0.3 * torch.randn(network.latent_avg.shape)
+    with torch.no_grad():
+        expected = network(to_network(frame), codes[None], amount * network.editing_w[:1], levels=6)
+        unedited = network(to_network(frame), codes[None], levels=6)
+    engine = Engine(lambda: network, fast.compile_clip, StyleganexConfig(levels=6, edit=amount))
+    drawn = engine.run(frame, codes.numpy())
+    assert np.abs(drawn.astype(int) - to_bytes(expected, "nearest").numpy()).max() <= 1
+    assert np.abs(drawn.astype(int) - to_bytes(unedited, "nearest").numpy()).max() > 5
+
+
+def test_a_style_file_is_opened_by_its_path(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"style file .*mine\.safetensors does not exist"):
+        stylize.get(str(tmp_path / "mine.safetensors"))
+    (tmp_path / "mine.safetensors").write_bytes(b"not weights")
+    style = stylize.get(str(tmp_path / "mine.safetensors"))
+    assert style.name == "mine" and stylize.files(str(tmp_path / "mine.safetensors")) != ()
+    frames, marks = scene.frames(2, 96, 80), scene.landmarks(2, 96, 80)
+    with pytest.raises(AssetError, match=r"mine\.safetensors is damaged"):
+        stylize.prepare(iter(frames), marks, style)

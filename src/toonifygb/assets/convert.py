@@ -55,6 +55,18 @@ _MOST_PICKLE_BYTES = 32 * 2**20
 _MOST_MODEL_BYTES = 256 * 2**20
 """A plain pickle holds its numbers itself; those of FLAME take 50."""
 _MOST_VALUES, _MOST_DEPTH = 200_000, 32
+_MOST_AXES, _MOST_LENGTH = 16, 2**62
+_MARK = object()
+_KEY_KINDS = (
+    pickletools.pyunicode,
+    pickletools.pystring,
+    pickletools.pybytes_or_str,
+    pickletools.pyint,
+    pickletools.pylong,
+    pickletools.pyinteger_or_bool,
+    pickletools.pybool,
+)
+"""What may be a key: text as any protocol writes it, and whole numbers."""
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 _LEGACY_PROTOCOL = 1001
 _ZIP_START = b"PK\x03\x04"
@@ -224,7 +236,8 @@ def _read_stream(data: memoryview, path: Path) -> Any:
         values.append(_run(data[start:end], storage, path))
         start = end
     magic, protocol, _, value, keys = values
-    if (magic, protocol) != (_LEGACY_MAGIC, _LEGACY_PROTOCOL) or set(keys) != set(lengths):
+    is_named = isinstance(keys, list) and all(isinstance(key, str) for key in keys)
+    if (magic, protocol) != (_LEGACY_MAGIC, _LEGACY_PROTOCOL) or not is_named or set(keys) != set(lengths):
         raise AssetError(f"{path} is no checkpoint of torch")
     for key in keys:
         kind, length = lengths[key]
@@ -235,13 +248,76 @@ def _read_stream(data: memoryview, path: Path) -> Any:
     return value
 
 
+class _Keys:
+    """Follows the unpickler's stack and lets nothing become a key but strings and whole numbers.
+
+    Keys are hashed, and a tuple hashes all it holds, each time: one whose two items are the same tuple, and so on
+    60 times, is written in 300 bytes and takes longer than a life.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._stack: list[Any] = []
+        """For each value whether it may be a key; _MARK where one was set."""
+        self._memo: dict[int, bool] = {}
+
+    def follow(self, instruction: pickletools.OpcodeInfo, argument: Any) -> None:
+        """Takes in the next instruction.
+
+        Raises:
+            AssetError: it would make something else a key.
+            IndexError: it takes values that are not there.
+        """
+        name = instruction.name
+        if name == "SETITEM":
+            self._check([self._stack[-2]])
+        elif name in ("SETITEMS", "DICT"):
+            self._check(self._above_mark()[::2])
+        elif name in ("ADDITEMS", "FROZENSET"):
+            self._check(self._above_mark())
+        if name in ("PUT", "BINPUT", "LONG_BINPUT"):
+            self._memo[int(argument)] = self._stack[-1]
+        elif name == "MEMOIZE":
+            self._memo[len(self._memo)] = self._stack[-1]
+        elif name in ("GET", "BINGET", "LONG_BINGET"):
+            self._stack.append(self._memo.get(int(argument), False))
+        elif name == "DUP":
+            self._stack.append(self._stack[-1])
+        else:
+            self._take(instruction)
+
+    def _take(self, instruction: pickletools.OpcodeInfo) -> None:
+        """What an ordinary instruction takes off the stack and lays on it."""
+        before = instruction.stack_before
+        if pickletools.stackslice in before:
+            del self._stack[len(self._stack) - len(self._above_mark()) - 1 :]
+            before = before[: before.index(pickletools.markobject)]
+        for _ in before:
+            self._stack.pop()
+        for kind in instruction.stack_after:
+            self._stack.append(_MARK if kind is pickletools.markobject else kind in _KEY_KINDS)
+
+    def _above_mark(self) -> list[bool]:
+        place = len(self._stack) - 1
+        while self._stack[place] is not _MARK:
+            place -= 1
+        return self._stack[place + 1 :]
+
+    def _check(self, keys: list[Any]) -> None:
+        if not all(key is True for key in keys):
+            raise AssetError(
+                f"{self._path} has keys that are neither text nor whole numbers; nothing was run", _KEEP_OUT
+            )
+
+
 def _inspect(program: memoryview, path: Path, most_bytes: int = _MOST_PICKLE_BYTES) -> int:
     """Length of the pickle at the start of ``program``, whose instructions are looked at but not run.
 
     Raises:
-        AssetError: it names anything beyond the names we know, or asks for more memory than it can fill.
+        AssetError: it names anything beyond the names we know, asks for more memory than it can fill, or for the
+            hash of more than a text or number.
     """
-    known = set(_names())
+    known, keys = set(_names()), _Keys(path)
     if len(program) > most_bytes:
         raise AssetError(f"{path} describes its tensors in {len(program)} bytes; more than any network needs")
     for count, (instruction, argument, position) in enumerate(pickletools.genops(program.tobytes())):
@@ -254,6 +330,7 @@ def _inspect(program: memoryview, path: Path, most_bytes: int = _MOST_PICKLE_BYT
             raise AssetError(f"{path} is damaged: it numbers its objects beyond their count")
         elif name == "STOP":
             return (position or 0) + 1
+        keys.follow(instruction, argument)
     raise AssetError(f"{path} is damaged or cut short", "download it again")
 
 
@@ -320,8 +397,17 @@ def _names(room: _Room | None = None) -> dict[tuple[str, str], Any]:
     return names | pickled.bags() | {("torch", kind): kind for kind in _STORAGES}
 
 
+def _ordered(pairs: Any = ()) -> OrderedDict[str | int, Any]:
+    """An ordered dict of pairs, as Python 2 wrote them."""
+    if not all(len(pair) == 2 and isinstance(pair[0], str | int) for pair in pairs):
+        raise AssetError("a table of the checkpoint has keys that are neither text nor whole numbers", _KEEP_OUT)
+    return OrderedDict(pairs)
+
+
 def _scalar(dtype: pickled.Dtype, data: bytes) -> float | int | bool:
     """Value of a numpy scalar."""
+    if not isinstance(dtype, pickled.Dtype) or type(dtype.code) is not str:
+        raise AssetError("a number of the checkpoint has no kind", "download it again")
     return np.frombuffer(data, _NUMPY_SCALARS[dtype.code])[0].item()
 
 
@@ -329,9 +415,9 @@ def _tensor(storage: Any, offset: int, size: Any, stride: Any, *_: object) -> St
     """A tensor, if all of it lies within its storage."""
     shape, strides = tuple(size), tuple(stride)
     numbers = (offset, *shape, *strides)
-    if not isinstance(storage, _Storage) or len(shape) != len(strides):
+    if not isinstance(storage, _Storage) or len(shape) != len(strides) or len(shape) > _MOST_AXES:
         raise AssetError("a tensor of the checkpoint has no storage or no shape", "download it again")
-    if not all(type(number) is int and number >= 0 for number in numbers):
+    if not all(type(number) is int and 0 <= number < _MOST_LENGTH for number in numbers):
         raise AssetError("a tensor of the checkpoint has sizes that are no counts", "download it again")
     last = offset + sum((length - 1) * step for length, step in zip(shape, strides, strict=True))
     if math.prod(shape) > storage.length or (0 not in shape and last >= storage.length):
@@ -343,7 +429,7 @@ def _tensor(storage: Any, offset: int, size: Any, stride: Any, *_: object) -> St
 
 
 _FUNCTIONS: dict[tuple[str, str], Callable[..., Any]] = {
-    ("collections", "OrderedDict"): OrderedDict,
+    ("collections", "OrderedDict"): _ordered,
     ("torch._utils", "_rebuild_tensor_v2"): _tensor,
     ("torch._utils", "_rebuild_tensor"): _tensor,
     ("torch._utils", "_rebuild_parameter"): lambda value, *_: value,
@@ -375,7 +461,8 @@ def _run(program: memoryview, stored: Callable[[str, str, int], _Storage], path:
 
         def persistent_load(self, pid: Any) -> _Storage:
             tag, kind, key, _, count = pid[:5]
-            if tag != "storage" or kind not in _STORAGES or type(key) is not str or type(count) is not int:
+            kinds = tuple(map(type, (tag, kind, key, count)))
+            if kinds != (str, str, str, int) or tag != "storage" or kind not in _STORAGES:
                 raise AssetError(f"{path} refers to something other than numbers")
             return stored(kind, key, count)
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from toonifygb.cli.assets import assets
 from toonifygb.cli.progress import Terminal
+from toonifygb.cli.style import style
 from toonifygb.config import (
     PRESETS,
     WHOLE_PICTURE,
@@ -46,7 +47,7 @@ def create(
     Args:
         clip: Video file or folder of images with one person's head.
         out: Folder of the run; runs/<clip name>-<style> when unset.
-        style: toon, paint, ink or none; arcane, cartoon or pixar (assets get styleganex-...); or a model file.
+        style: toon, paint, ink or none; arcane, cartoon, pixar, age or hair (assets get styleganex-...); or a file.
         quality: draft (minutes), standard, or paper (the published regime).
         strength: Blend between the original (0) and the full style (1).
         track_on: Video whose landmarks the head model is fitted to.
@@ -79,7 +80,7 @@ def demo(
 
     Args:
         out: Folder of the run.
-        style: toon, paint, ink or none; arcane, cartoon or pixar (assets get styleganex-...); or a model file.
+        style: toon, paint, ink or none; arcane, cartoon, pixar, age or hair (assets get styleganex-...); or a file.
         n_frames: Length of the synthetic clip.
         seed: Which synthetic person.
         quiet: Say nothing but errors.
@@ -110,7 +111,7 @@ def stylize(
     Args:
         clip: Video file or folder of images.
         out: Video file to write (.mp4).
-        style: toon, paint, ink or none; arcane, cartoon or pixar (assets get styleganex-...); or a model file.
+        style: toon, paint, ink or none; arcane, cartoon, pixar, age or hair (assets get styleganex-...); or a file.
         strength: Blend between the original (0) and the full style (1).
         choose_face: Which face to follow where several are visible.
         max_frames: Use only the first frames.
@@ -320,6 +321,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "import": import_,
     "export": export,
     "assets": assets,
+    "style": style,
     "doctor": doctor,
 }
 

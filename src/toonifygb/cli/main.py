@@ -92,7 +92,9 @@ def _command(name: str, argv: list[str]) -> None:
         )
     import tyro
 
-    tyro.cli(COMMANDS[name], prog=f"toonifygb {name}", args=argv, config=(tyro.conf.FlagCreatePairsOff,))
+    # Settings of a dataclass are options of the command itself: --steps, not --config.steps.
+    markers = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
+    tyro.cli(COMMANDS[name], prog=f"toonifygb {name}", args=argv, config=markers)
 
 
 def _fail(error: ToonifyError) -> int:

@@ -5,7 +5,16 @@ from __future__ import annotations
 from functools import partial
 
 from toonifygb.stylize.anchors import Faces, follow
-from toonifygb.stylize.base import Stylizer, WeightedStyle, available, files, get, register, register_weighted
+from toonifygb.stylize.base import (
+    Stylizer,
+    WeightedStyle,
+    available,
+    files,
+    get,
+    register,
+    register_kind,
+    register_weighted,
+)
 from toonifygb.stylize.ink import Ink
 from toonifygb.stylize.paint import Paint
 from toonifygb.stylize.plain import Plain
@@ -20,6 +29,7 @@ for _name in _styleganex.STYLES:
     register_weighted(
         _name, WeightedStyle(partial(_styleganex.open_style, _name), partial(_styleganex.weights, _name))
     )
+register_kind(".safetensors", _styleganex.open_file)
 
 __all__ = [
     "Faces",
@@ -31,6 +41,7 @@ __all__ = [
     "get",
     "prepare",
     "register",
+    "register_kind",
     "register_weighted",
     "stylize_frames",
     "warp_frames",

@@ -65,6 +65,7 @@ class Stylizer(Protocol):
 
 _FACTORIES: dict[str, Callable[[], Stylizer]] = {}
 _WITH_WEIGHTS: dict[str, WeightedStyle] = {}
+_BY_SUFFIX: dict[str, Callable[[Path, StyleganexConfig], Stylizer]] = {}
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,11 @@ def register_weighted(name: str, style: WeightedStyle) -> None:
     _WITH_WEIGHTS[name] = style
 
 
+def register_kind(suffix: str, open_file: Callable[[Path, StyleganexConfig], Stylizer]) -> None:
+    """Makes ``get`` open files whose names end in ``suffix`` by ``open_file``."""
+    _BY_SUFFIX[suffix] = open_file
+
+
 def available() -> tuple[str, ...]:
     """Names of the styles that work without further files."""
     return tuple(sorted(_FACTORIES))
@@ -96,7 +102,8 @@ def get(name: str, options: StyleganexConfig | None = None) -> Stylizer:
     """The style of that name; the network of a weighted style is not read before it is used.
 
     Args:
-        name: of a style, or path of a model file (``.onnx``, ``.ts``, ``.torchscript``; see ``plugin``).
+        name: of a style, or path of a file: a model (``.onnx``, ``.ts``, ``.torchscript``; see ``plugin``), or a
+            style of StyleGANEX (``.safetensors``).
         options: settings of the styles that run StyleGANEX.
 
     Raises:
@@ -107,6 +114,9 @@ def get(name: str, options: StyleganexConfig | None = None) -> Stylizer:
         return _FACTORIES[name]()
     if name in _WITH_WEIGHTS:
         return _WITH_WEIGHTS[name].open(options or StyleganexConfig())
+    suffix = Path(name).suffix.lower()
+    if suffix in _BY_SUFFIX:
+        return _BY_SUFFIX[suffix](Path(name), options or StyleganexConfig())
     if plugin.is_model_file(name):
         return plugin.open_model(Path(name))
     near = difflib.get_close_matches(name, (*available(), *_WITH_WEIGHTS), n=1, cutoff=0.0)
@@ -121,4 +131,6 @@ def files(name: str) -> tuple[Path, ...]:
     if name in _WITH_WEIGHTS:
         weights = _WITH_WEIGHTS[name].weights()
         return () if weights is None else (weights,)
+    if Path(name).suffix.lower() in _BY_SUFFIX:
+        return (Path(name),)
     return plugin.model_files(Path(name)) if plugin.is_model_file(name) else ()

@@ -33,10 +33,10 @@ def load_image(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
     except OSError as error:
         raise InputError(f"image {path} cannot be read: {error.strerror}", "check the path") from error
     # Bytes are decoded rather than the path, which OpenCV cannot open on Windows when it is not ASCII.
-    stored = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    stored = _decoded(data, cv2.IMREAD_UNCHANGED) if data.size else None
     # Decoded twice because only the second mode applies the EXIF rotation and brings every depth to 8 bits, and
     # only the first keeps alpha.
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if stored is not None else None
+    image = _decoded(data, cv2.IMREAD_COLOR) if stored is not None else None
     if stored is None or image is None:
         raise InputError(f"{path} is not an image that can be read", f"use one of {', '.join(IMAGE_SUFFIXES)}")
     step = _ALPHA_STEPS.get(stored.dtype.name)
@@ -45,6 +45,14 @@ def load_image(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
         rgba = np.concatenate((cv2.cvtColor(image, cv2.COLOR_BGR2RGB), alpha), axis=2)
         return flatten_alpha(rgba)[0]
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _decoded(data: UInt8[np.ndarray, " n"], mode: int) -> np.ndarray | None:
+    """What OpenCV makes of a file's bytes; None where it refuses them, or the size they claim."""
+    try:
+        return cv2.imdecode(data, mode)
+    except cv2.error:
+        return None
 
 
 def load_rgba(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 4"]:
@@ -58,7 +66,7 @@ def load_rgba(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 4"]:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
         raise InputError(f"image {path} cannot be read: {error.strerror}", "check the path") from error
-    stored = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    stored = _decoded(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if stored is None or stored.dtype.name not in _ALPHA_STEPS:
         raise InputError(f"{path} is not an image that can be read", f"use one of {', '.join(IMAGE_SUFFIXES)}")
     image = (stored // _ALPHA_STEPS[stored.dtype.name]).astype(np.uint8)

@@ -78,7 +78,7 @@ class FaceMarks:
 class Aligned:
     """An aligned face and where it was."""
 
-    image: UInt8[np.ndarray, "256 256 3"]
+    image: UInt8[np.ndarray, "s s 3"]
     quad: Quad
     """Corners of ``image`` in the frame, continuous px (x, y): top left, bottom left, bottom right, top right."""
 
@@ -95,17 +95,18 @@ def face_quad(marks: FaceMarks) -> Quad:
     return np.stack([middle - x - y, middle - x + y, middle + x + y, middle + x - y])
 
 
-def align_face(image: Image, marks: FaceMarks) -> Aligned:
+def align_face(image: Image, marks: FaceMarks, aligned_px: int = ALIGNED_SIZE) -> Aligned:
     """The aligned picture of a face.
 
     Args:
         image: the frame.
         marks: where the face is in it; the square around it may reach beyond the frame, which is then continued
             by its blurred mirror image.
+        aligned_px: side of the result.
     """
     quad = face_quad(marks)
     size = float(np.hypot(*(quad[2] - quad[1])))
-    factor = max(1, int(np.floor(size / ALIGNED_SIZE * 0.5)))
+    factor = max(1, int(np.floor(size / aligned_px * 0.5)))
     # the original divides array indices as it shrinks the picture, which moves it by a part of a pixel
     place = quad + 0.5 * factor
     if factor > 1:
@@ -115,7 +116,7 @@ def align_face(image: Image, marks: FaceMarks) -> Aligned:
     border = max(int(np.rint(size * 0.1)), 3)
     image, quad = _cropped(image, quad, border)
     image, quad = _padded(image, quad, border, size)
-    return Aligned(sample_quad(image, quad + 0.5, ALIGNED_SIZE), place)
+    return Aligned(sample_quad(image, quad + 0.5, aligned_px), place)
 
 
 def shrink(image: Image, width: int, height: int) -> Image:

@@ -36,6 +36,7 @@ class Network(Protocol):
     """What a network has to offer; ``network.StyleGANEX`` does."""
 
     latent_avg: Float[Tensor, "18 512"]
+    editing_w: Float[Tensor, "k 18 512"]
 
     def codes(self, x2: Float[Tensor, "n 3 256 256"]) -> Float[Tensor, "n 18 512"]:
         """Style codes of aligned faces in -1..1."""
@@ -115,7 +116,10 @@ class Engine:
         if self._clip is None or self._clip[0] != key:
             w_plus = torch.from_numpy(codes)[None].to(self._device)
             dtype = getattr(torch, self.config.precision)
-            self._clip = key, self._compile(self._loaded(), w_plus, dtype=dtype, levels=self.config.levels)
+            network = self._loaded()
+            # As published, of several editing vectors the first one counts.
+            edit = {"edit": self.config.edit * network.editing_w[:1]} if len(network.editing_w) else {}
+            self._clip = key, self._compile(network, w_plus, dtype=dtype, levels=self.config.levels, **edit)
             if self.config.codes != "each":
                 self._network = None  # 1.3 GB that the frames of a clip do not need
         return self._clip[1]

@@ -1,4 +1,4 @@
-"""The styles that StyleGANEX's published weights make, by name."""
+"""The styles that StyleGANEX's weights make: the published ones by name, others by their file."""
 
 from __future__ import annotations
 
@@ -23,6 +23,8 @@ STYLES = {
     "arcane": "faces in the painted manner of the series Arcane",
     "cartoon": "faces as in a drawn comic",
     "pixar": "faces as in an animated film of Pixar",
+    "age": "the same faces, older or younger: see styleganex.edit",
+    "hair": "the same faces with hair of another colour: see styleganex.edit",
 }
 """What each looks like, in one line; its weights are the asset ``styleganex-<name>``."""
 
@@ -49,9 +51,24 @@ def open_style(name: str, config: StyleganexConfig) -> Stylizer:
             f"style '{name}' needs the model {asset}, which is not here",
             f"get it with: toonifygb assets get {asset}; without one, {nearest!r} comes nearest",
         )
+    return _stylizer(name, STYLES[name], path, config)
+
+
+def open_file(path: Path, config: StyleganexConfig) -> Stylizer:
+    """The style in a file of ours, as ``toonifygb style train`` and ``assets get`` write them.
+
+    Raises:
+        InputError: no such file, or settings contradict each other.
+    """
+    if not path.is_file():
+        raise InputError(f"style file {path} does not exist", "check the path")
+    return _stylizer(path.stem, f"faces in the style of {path.name}", path, config)
+
+
+def _stylizer(name: str, description: str, path: Path, config: StyleganexConfig) -> Stylizer:
     engine = Engine(partial(load, path), compile_clip, config)
     kind = AlignedStylizer if config.framing == "aligned" else StyleganexStylizer
-    return kind(name, STYLES[name], engine)
+    return kind(name, description, engine)
 
 
 def _asset(name: str) -> str:
