@@ -10,6 +10,7 @@ import logging
 import os
 import sys
 import types
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
 
@@ -20,9 +21,10 @@ from test_render_fused import WIDTHS, coefficients, doubles, skinned
 
 from toonifygb import render
 from toonifygb.errors import BackendError
-from toonifygb.render import RenderInfo, cuda, reference
+from toonifygb.render import RenderInfo, cuda, library, reference
 from toonifygb.render.base import DEFAULT_CONSTANTS, RasterConstants
 from toonifygb.render.fused import Kernels, ReferenceKernels, expand_scale, learning_rates
+from toonifygb.render.proof import disagreement
 from toonifygb.render.reference import ReferenceRenderer
 from toonifygb.render.tiles import tile_lists
 
@@ -242,11 +244,45 @@ def test_auto_takes_the_gpu(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogC
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "a card")
     monkeypatch.setattr(cuda, "unavailable", lambda name="cuda": None)
+    monkeypatch.setattr(cuda, "CudaRenderer", ReferenceRenderer)
     render.resolve_backend.cache_clear()
     with caplog.at_level(logging.INFO, logger="toonifygb.render"):
         assert render.resolve_backend("auto") == "cuda"
     render.resolve_backend.cache_clear()
     assert caplog.messages == ["backend auto: CUDA (a card)"]
+
+
+class _Shifted(ReferenceRenderer):
+    """A renderer that is wrong by a half-pixel's worth of everything."""
+
+    def render(self, splats, camera, **settings):
+        return super().render(replace(splats, means=splats.means + 1e-3), camera, **settings)
+
+
+class _Broken(ReferenceRenderer):
+    def render(self, splats, camera, **settings):
+        raise ValueError("no such instruction")
+
+
+@pytest.mark.parametrize(
+    ("kind", "reason"),
+    [(_Shifted, "its picture of a small scene is off by"), (_Broken, "it fails on a small picture")],
+)
+def test_auto_does_not_take_a_gpu_that_draws_something_else(
+    kind: type, reason: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(cuda, "unavailable", lambda name="cuda": None)
+    monkeypatch.setattr(cuda, "CudaRenderer", kind)
+    render.resolve_backend.cache_clear()
+    with caplog.at_level(logging.INFO, logger="toonifygb.render"):
+        assert render.resolve_backend("auto") in ("native", "reference")
+    render.resolve_backend.cache_clear()
+    assert reason in caplog.messages[0]
+
+
+def test_native_engine_passes_the_same_proof() -> None:
+    assert disagreement(render.get("native" if library.unavailable() is None else "reference", 1)) is None
 
 
 def _gsplat_in_torch(

@@ -11,6 +11,7 @@ import torch
 from toonifygb.errors import InputError
 from toonifygb.render import cuda, library
 from toonifygb.render.base import DEFAULT_CONSTANTS, RasterConstants, Renderer, RenderInfo
+from toonifygb.render.proof import disagreement
 
 if TYPE_CHECKING:
     from toonifygb.render.fused import Kernels
@@ -30,7 +31,7 @@ def resolve_backend(backend: str) -> str:
     if backend != "auto":
         return backend
     if torch.cuda.is_available():
-        reason = cuda.unavailable()
+        reason = cuda.unavailable() or disagreement(cuda.CudaRenderer())
         if reason is None:
             log.info("backend auto: CUDA (%s)", torch.cuda.get_device_name())
             return "cuda"
@@ -48,7 +49,7 @@ def get(backend: str = "auto", threads: int | None = None) -> Renderer:
 
     Args:
         backend: ``cuda`` (Triton), ``gsplat``, ``native``, ``reference``, or ``auto``: cuda where there is a device
-            for it, else native where it is built.
+            for it and it draws a small scene as the reference does, else native where it is built.
         threads: threads of the native engine; all available processors when ``None``.
 
     Raises:
