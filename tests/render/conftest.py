@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from toonifygb.render.fused import Kernels
 
 BACKENDS = ("reference", "native", *(() if cuda.unavailable() else ("cuda",)))
-"""CUDA joins where there is a device (or Triton's interpreter); ``test_render_cuda.py`` says so where there is none."""
+"""CUDA joins where it can run; ``test_render_cuda.py`` says why where it cannot."""
 
 
 def _require(backend: str) -> None:
