@@ -27,8 +27,11 @@ def test_a_head_that_never_turned_is_hardly_walked_around() -> None:
 
 
 def test_the_view_keeps_within_the_sides_the_head_showed() -> None:
-    yaw = 25 * np.sin(np.linspace(0, 25, 400))
+    yaw = 10 + 25 * np.sin(np.linspace(0, 25, 400))
     swing = swing_deg(turning(yaw), 25.0)
-    assert swing.max() > 30
-    assert np.abs(swing - yaw).max() < 36.5  # seen from the head: 25 degrees filmed and 10 beyond
+    assert swing.max() > 25
+    assert swing.min() < -30
+    shown = yaw - swing  # the head's turn as the moving view sees it: 25 degrees filmed to each side and 10 beyond
+    assert shown.max() < 10 + 36
+    assert shown.min() > 10 - 36
     assert np.abs(np.diff(swing)).max() < 3  # and never jumps

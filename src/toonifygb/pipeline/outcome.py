@@ -135,11 +135,12 @@ def swing_deg(sequence: TrackedSequence, fps: float) -> Float[np.ndarray, " t"]:
     """
     yaw = pose_quantities(sequence.motion)[:, 2].rad2deg().numpy()
     seen = yaw[sequence.tracked.numpy()]
-    side = np.quantile(np.abs(seen - np.median(seen)), 0.95)
-    limit = max(side + _SWING_BEYOND_DEG, _SWING_LEAST_DEG)
-    swing = _SWING_DEG * np.sin(2 * np.pi * np.arange(len(yaw)) / min(_SWING_SECONDS * fps, len(yaw)))
-    turned = yaw - np.median(seen)
-    return swing.clip(turned - limit, turned + limit)
+    middle, (low, high) = np.median(seen), np.quantile(seen, (0.05, 0.95))
+    low = min(low - _SWING_BEYOND_DEG, middle - _SWING_LEAST_DEG)
+    high = max(high + _SWING_BEYOND_DEG, middle + _SWING_LEAST_DEG)
+    period = min(_SWING_SECONDS * fps, len(yaw))
+    swing = _SWING_DEG * np.sin(2 * np.pi * np.arange(len(yaw)) / period)
+    return swing.clip(yaw - high, yaw - low)  # seen from the camera's place the head is turned by yaw - swing
 
 
 def write_report(source: Source, run: Run, config: RunConfig, scored: str, shown: str) -> None:
