@@ -28,11 +28,7 @@ def load_image(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
         InputError: no such file, or not an image.
     """
     path = Path(path)
-    try:
-        data = np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise InputError(f"image {path} cannot be read: {error.strerror}", "check the path") from error
-    # Bytes are decoded rather than the path, which OpenCV cannot open on Windows when it is not ASCII.
+    data = _file_bytes(path)
     stored = _decoded(data, cv2.IMREAD_UNCHANGED) if data.size else None
     # Decoded twice because only the second mode applies the EXIF rotation and brings every depth to 8 bits, and
     # only the first keeps alpha.
@@ -45,6 +41,18 @@ def load_image(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
         rgba = np.concatenate((cv2.cvtColor(image, cv2.COLOR_BGR2RGB), alpha), axis=2)
         return flatten_alpha(rgba)[0]
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _file_bytes(path: Path) -> UInt8[np.ndarray, " n"]:
+    """The file as it is: bytes are decoded, because OpenCV cannot open a path on Windows that is not ASCII.
+
+    Raises:
+        InputError: no such file, or not to be read.
+    """
+    try:
+        return np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise InputError(f"image {path} cannot be read: {error.strerror}", "check the path") from error
 
 
 def _decoded(data: UInt8[np.ndarray, " n"], mode: int) -> np.ndarray | None:
@@ -62,10 +70,7 @@ def load_rgba(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 4"]:
         InputError: no such file, or not an image.
     """
     path = Path(path)
-    try:
-        data = np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise InputError(f"image {path} cannot be read: {error.strerror}", "check the path") from error
+    data = _file_bytes(path)
     stored = _decoded(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if stored is None or stored.dtype.name not in _ALPHA_STEPS:
         raise InputError(f"{path} is not an image that can be read", f"use one of {', '.join(IMAGE_SUFFIXES)}")
