@@ -21,7 +21,15 @@ from toonifygb.structures import GaussianParams, TrackedSequence
 from toonifygb.train import Dataset, build_dataset, evaluate, first_avatar, train
 from toonifygb.train.densify import DensifyRules
 from toonifygb.train.losses import LossWeights, image_loss, mouth_loss, placed_on
-from toonifygb.train.optim import DELTA_EPS, DELTA_RATES, FULL_STEPS, NEUTRAL_RATES, means_decay, settling
+from toonifygb.train.optim import (
+    DELTA_EPS,
+    DELTA_RATES,
+    DRIVER_TRAVEL,
+    FULL_STEPS,
+    NEUTRAL_RATES,
+    means_decay,
+    settling,
+)
 from toonifygb.train.state import TrainState, read_checkpoint, write_checkpoint
 from toonifygb.train.step import Stepper
 
@@ -58,19 +66,21 @@ class PlainTraining:
     def __init__(self, template: Avatar) -> None:
         self.state = TrainState.start(template, TINY.seed)
         self.template = template
-        n_expression = template.n_expressions + template.n_eyelids
+        self.n_expression = n_expression = template.n_expressions + template.n_eyelids
         self.scale = torch.ones(len(template.blendshape_names), self.state.counts.face)
         self.scale[:n_expression] = 0.0
         self.scale[:n_expression, : self.state.counts.moved] = self.state.scale
         sets = [template.neutral, template.mouth_upper, template.mouth_lower]
         self.sets = [part.map(lambda t: t.clone().requires_grad_()) for part in sets]
         self.trained = template.deltas.map(lambda t: torch.zeros_like(t).requires_grad_())
-        self.groups = []
+        self.groups, self.driver_share = [], {}
         for name in FIELDS:
             key = "sh_dc" if name == "sh" else name
             faster = FULL_STEPS / TINY.steps if name in {"means", "opacity_logits"} else 1
             self.add([getattr(part, name) for part in self.sets], NEUTRAL_RATES[key], name != "means", 1e-15)
-            self.add([getattr(self.trained, name)], DELTA_RATES[key] * faster, True, DELTA_EPS)
+            rate = DELTA_RATES[key] * faster
+            self.add([getattr(self.trained, name)], rate, True, DELTA_EPS)
+            self.driver_share[name] = DRIVER_TRAVEL[key] / TINY.steps / rate
         self.adam = torch.optim.Adam([dict(group) for group in self.groups])
         self.volume = MouthVolume.around(join([template.mouth_upper, template.mouth_lower]).means)
 
@@ -91,6 +101,7 @@ class PlainTraining:
             )
             damped = scale_deltas(change, self.scale)
             for name in FIELDS:
+                getattr(damped, name)[self.n_expression :] *= self.driver_share[name]
                 getattr(self.trained, name).copy_(getattr(before, name) + getattr(damped, name))
 
     def step(self, dataset: Dataset, sequence: TrackedSequence) -> None:
