@@ -1,4 +1,4 @@
-"""``python -m benchmarks``: every benchmark that is not too long; ``python -m benchmarks rasterizer``: one of them."""
+"""``python -m benchmarks``: all benchmarks but the longest; ``python -m benchmarks rasterizer``: one of them."""
 
 from __future__ import annotations
 

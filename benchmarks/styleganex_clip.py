@@ -3,7 +3,8 @@ run that is killed once ends with the same frames.
 
 ``toonifygb stylize`` runs three times in processes of their own: to the end; until it has had half of the first
 one's processor time, when it is killed with signal 9; and again, to the end. The network has full width and weights
-from a seed. It stops at its input's size (``styleganex.levels=6``), which takes half the time of all levels. The clip is the middle of ``d9.mp4`` in the folder named by ``TOONIFYGB_VIDEOS``.
+from a seed. It stops at its input's size (``styleganex.levels=6``), which takes half the time of all levels. The
+clip is the middle of ``d9.mp4`` in the folder named by ``TOONIFYGB_VIDEOS``.
 
 Runs only when named, takes about an hour of one core, and needs Linux, whose ``/proc`` is read.
 """
