@@ -17,13 +17,13 @@ from toonifygb.config import StyleganexConfig
 from toonifygb.errors import InputError
 from toonifygb.progress import Stopped
 from toonifygb.structures import Landmarks
-from toonifygb.stylize.styleganex.frame import CropRule
 from toonifygb.styletrain import train_style
 from toonifygb.styletrain.discriminator import Discriminator
 from toonifygb.styletrain.encode import Encode
 from toonifygb.styletrain.foundation import codes_of, draw, student
 from toonifygb.styletrain.perceptual import FeatureDistance
 from toonifygb.styletrain.transfer import Transfer
+from toonifygb.stylize.styleganex.frame import CropRule
 
 
 @pytest.fixture(autouse=True)

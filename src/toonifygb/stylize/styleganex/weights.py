@@ -1,7 +1,8 @@
 """Weights on disk: our safetensors files, and how the authors' checkpoints become such files.
 
 A file holds the state dict, ``latent_avg``, for edit networks ``editing_w``, and in its metadata the format's name
-and version, the variant as JSON, and the levels it was trained with where these are not all. Nothing is ever skipped in silence: a missing or surplus key is an error.
+and version, the variant as JSON, and the levels it was trained with where these are not all. Nothing is ever
+skipped in silence: a missing or surplus key is an error.
 """
 
 from __future__ import annotations
