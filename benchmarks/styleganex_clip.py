@@ -1,8 +1,8 @@
 """StyleGANEX over a clip of 300 frames of 512 x 512 px: what a user waits, whether memory stays flat, and whether a
 run that is killed once ends with the same frames.
 
-``toonifygb stylize`` runs in processes of their own, two at a time: one to the end; the other until it has begun its
-third segment of 64 frames, when it is killed with signal 9, and again to the end. The network has full width,
+``toonifygb stylize`` runs in processes of their own, two at a time: one to the end; the other until it has begun
+its third segment of 64 frames, when it is killed with signal 9, and again to the end. The network has full width,
 weights from a seed, and stops at its input's size (``styleganex.levels=6``), here 160 x 160 px: the clip is a
 close-up, a square of ``d9.mp4`` in the folder named by ``TOONIFYGB_VIDEOS``, so that it takes no hours.
 

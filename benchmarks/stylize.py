@@ -1,7 +1,7 @@
 """The stylize room: cost per frame of every style, and how steady its clips are beside their sources.
 
-Drawn styles first, then StyleGANEX (``styleganex``). The subject of the drawn styles' times is a drawn face, so they
-need no file. Steadiness is measured on clips in the folder named by ``TOONIFYGB_VIDEOS`` with landmarks from
+Drawn styles first, then StyleGANEX (``styleganex``). The subject of the drawn styles' times is a drawn face, so
+they need no file. Steadiness is measured on clips in the folder named by ``TOONIFYGB_VIDEOS`` with landmarks from
 ``TOONIFYGB_GOLDEN``, and left out where those are absent. It is told beside the source clip's; a style that
 multiplies contrast, like ``ink``, multiplies the clip's own motion with it.
 """
