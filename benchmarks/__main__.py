@@ -10,8 +10,8 @@ import benchmarks
 from benchmarks import harness
 
 SUPPORT = {"__main__", "harness", "scenes", "limits", "gpu"}
-ON_REQUEST = {"styleganex", "styleganex_clip"}
-"""Run only when named: a part of another one, or an hour of work."""
+ON_REQUEST = {"styleganex", "styleganex_clip", "styleganex_steady"}
+"""Run only when named: a part of another one, or long work about one room."""
 
 
 def main(arguments: list[str]) -> int:

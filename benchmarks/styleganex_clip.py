@@ -85,12 +85,22 @@ def measured(folder: Path) -> list[Figure]:
 
 
 def make_clip(path: Path) -> None:
-    """A square of the source clip at ``SIDE`` px."""
-    source = Path(os.environ.get("TOONIFYGB_VIDEOS", ROOT / "../shared/data/videos")) / "d9.mp4"
-    with video.Writer(path, SIDE, SIDE, video.probe(source).fps) as writer:
-        for frame in video.read(source, max_frames=FRAMES):
-            square = np.ascontiguousarray(frame[TOP : TOP + CUT, LEFT : LEFT + CUT])
-            writer.write(cv2.resize(square, (SIDE, SIDE), interpolation=cv2.INTER_CUBIC))
+    """The frames of ``squares`` as a video."""
+    with video.Writer(path, SIDE, SIDE, video.probe(source_clip()).fps) as writer:
+        for frame in squares():
+            writer.write(frame)
+
+
+def squares() -> Iterator[np.ndarray]:
+    """A square of the source clip's frames at ``SIDE`` px."""
+    for frame in video.read(source_clip(), max_frames=FRAMES):
+        square = np.ascontiguousarray(frame[TOP : TOP + CUT, LEFT : LEFT + CUT])
+        yield cv2.resize(square, (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)
+
+
+def source_clip() -> Path:
+    """The clip that the square is cut from."""
+    return Path(os.environ.get("TOONIFYGB_VIDEOS", ROOT / "../shared/data/videos")) / "d9.mp4"
 
 
 @dataclass
