@@ -40,10 +40,8 @@ FRAMES = 24
 PLAIN = StyleganexConfig(levels=6, calm=False)
 VERSIONS = {
     "StyleGANEX": PLAIN,
-    "codes of the first frame": replace(PLAIN, codes="first"),
     "calmed source": replace(PLAIN, calm=True),
     "aligned": replace(PLAIN, framing="aligned"),
-    "aligned, calmed source": replace(PLAIN, framing="aligned", calm=True),
 }
 NETWORK_SIDE = 160
 """Side of the network's input for this clip, px."""
