@@ -1,4 +1,4 @@
-"""``python -m benchmarks``: every benchmark; ``python -m benchmarks rasterizer``: one of them."""
+"""``python -m benchmarks``: all benchmarks but the longest; ``python -m benchmarks rasterizer``: one of them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import benchmarks
 from benchmarks import harness
 
 SUPPORT = {"__main__", "harness", "scenes", "limits", "gpu"}
+ON_REQUEST = {"styleganex", "styleganex_clip", "styleganex_steady", "styleganex_tried"}
+"""Run only when named: a part of another one, or long work about one room."""
 
 
 def main(arguments: list[str]) -> int:
@@ -19,7 +21,7 @@ def main(arguments: list[str]) -> int:
     if unknown:
         print(f"no benchmark {', '.join(unknown)}; there are: {', '.join(available)}", file=sys.stderr)
         return 2
-    for name in arguments or available:
+    for name in arguments or sorted(set(available) - ON_REQUEST):
         figures = importlib.import_module(f"benchmarks.{name}").run()
         harness.show(name, figures)
         harness.record(name, figures)

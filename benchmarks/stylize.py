@@ -1,8 +1,9 @@
 """The stylize room: cost per frame of every style, and how steady its clips are beside their sources.
 
-The subject of the times is a drawn face, so they need no file. Steadiness is measured on clips in the folder named
-by ``TOONIFYGB_VIDEOS`` with landmarks from ``TOONIFYGB_GOLDEN``, and left out where those are absent. It is told
-beside the source clip's; a style that multiplies contrast, like ``ink``, multiplies the clip's own motion with it.
+Drawn styles first, then StyleGANEX (``styleganex``). The subject of the drawn styles' times is a drawn face, so
+they need no file. Steadiness is measured on clips in the folder named by ``TOONIFYGB_VIDEOS`` with landmarks from
+``TOONIFYGB_GOLDEN``, and left out where those are absent. It is told beside the source clip's; a style that
+multiplies contrast, like ``ink``, multiplies the clip's own motion with it.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import cv2
 import numpy as np
 import torch
 
+from benchmarks import styleganex
 from benchmarks.harness import ROOT, Figure, cpu_seconds
 from toonifygb import stylize, video
 from toonifygb.metrics import stability
@@ -35,13 +37,14 @@ surface in the flow-warped error."""
 
 
 def run() -> list[Figure]:
-    """Times in ms of one core per frame; ITF (dB) and ISI above the source's; flow-warped error in levels."""
+    """Times of one core per frame; ITF (dB) and ISI above the source's; flow-warped error in levels."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        return times() + steadiness()
+        drawn = times() + steadiness()
     finally:
         cv2.setNumThreads(threads)
+    return drawn + styleganex.run()
 
 
 def times() -> list[Figure]:

@@ -58,9 +58,9 @@ class StyleganexConfig:
     """How far the styles age and hair go; below 0 they go the other way."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """bfloat16 is about twice as fast on processors that multiply in it, and differs by half a level on average."""
-    levels: int = 8
+    levels: int | None = None
     """Generator levels run: 8 for an output of 4 times the input's size, 7 for twice, 6 for the same; fewer are
-    faster and softer."""
+    faster and softer. All that the style was trained with when unset: 8 in published ones."""
     device: str = "auto"
     """Where the network runs: cpu, cuda, or auto (cuda where there is one)."""
 

@@ -258,6 +258,15 @@ def test_settings_that_cannot_be_are_named(options: dict, text: str) -> None:
         opened(**options)
 
 
+@pytest.mark.parametrize(("asked", "runs"), [(None, 6), (7, 7), (8, 8)])
+def test_levels_are_those_of_the_training_unless_asked_for(asked: int | None, runs: int) -> None:
+    config = StyleganexConfig(framing="full", size="super", levels=asked)
+    style = StyleganexStylizer("fake", "a stand-in", Engine(FakeNetwork, compile_clip, config, trained_levels=6))
+    frames, marks = clip(2)
+    height, width = stylize.prepare(iter(frames), marks, style)["rule"]["size"]
+    assert styled(style, frames, marks)[0].shape == (height << (runs - 6), width << (runs - 6), 3)
+
+
 @pytest.mark.parametrize("framing", ["full", "aligned"])
 def test_the_real_network_runs_by_name(framing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From a file where assets lie to frames, with StyleGANEX at a fraction of its width."""
@@ -298,9 +307,9 @@ def test_editing_styles_go_as_far_as_asked(amount: float) -> None:
 def test_a_style_file_is_opened_by_its_path(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"style file .*mine\.safetensors does not exist"):
         stylize.get(str(tmp_path / "mine.safetensors"))
-    (tmp_path / "mine.safetensors").write_bytes(b"not weights")
-    style = stylize.get(str(tmp_path / "mine.safetensors"))
-    assert style.name == "mine" and stylize.files(str(tmp_path / "mine.safetensors")) != ()
-    frames, marks = scene.frames(2, 96, 80), scene.landmarks(2, 96, 80)
+    path = tmp_path / "mine.safetensors"
+    weights.save(make_network(dataclasses.replace(PUBLISHED["toonify"], width=NARROW)), path)
+    assert stylize.get(str(path)).name == "mine" and stylize.files(str(path)) == (path,)
+    path.write_bytes(b"not weights")
     with pytest.raises(AssetError, match=r"mine\.safetensors is damaged"):
-        stylize.prepare(iter(frames), marks, style)
+        stylize.get(str(path))

@@ -67,6 +67,18 @@ def test_round_trips_are_exact(name: str, tmp_path: Path) -> None:
     assert_same(weights.load(tmp_path / "saved.safetensors"), network)
 
 
+def test_a_file_says_with_how_many_levels_it_was_trained(network: StyleGANEX, tmp_path: Path) -> None:
+    path = tmp_path / "ours.safetensors"
+    for options, levels in (({}, 8), ({"levels": 6}, 6)):
+        weights.save(network, path, **options)
+        assert weights.trained_levels(path) == levels
+    weights.save(network, path, levels=5)
+    with pytest.raises(AssetError, match="trained with '5' levels"):
+        weights.trained_levels(path)
+    converted(network, tmp_path)
+    assert weights.trained_levels(path) == 8, "published networks"
+
+
 def test_a_loaded_network_computes_the_same(network: StyleGANEX, tmp_path: Path) -> None:
     loaded = converted(network, tmp_path)
     frame = torch.rand(1, 3, 32, 32) * 2 - 1

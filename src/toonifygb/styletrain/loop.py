@@ -137,7 +137,7 @@ def train_style(images: Path, base: str, out: Path, config: StyleTrainConfig, re
         stage,
         _Plan("encoder", "teaching the encoder", config.encoder_steps, lambda: preview.of_encode(stage)),
     )
-    weights.save(network.cpu(), out)
+    weights.save(network.cpu(), out, levels=LEVELS[config.resolution])
 
 
 def _taught(

@@ -54,15 +54,22 @@ class Engine:
         load: reads the network, on the CPU.
         compile_clip: ``fast.compile_clip`` or its equal: specialises a network to the codes of a clip.
         config: precision, levels, device, and how colours become bytes.
+        trained_levels: levels that the network was trained with, for settings that name none.
     """
 
     def __init__(
-        self, load: Callable[[], Network], compile_clip: Callable[..., Callable], config: StyleganexConfig
+        self,
+        load: Callable[[], Network],
+        compile_clip: Callable[..., Callable],
+        config: StyleganexConfig,
+        trained_levels: int = 8,
     ) -> None:
-        if config.levels not in (6, 7, 8):
+        if config.levels not in (None, 6, 7, 8):
             raise InputError(f"setting styleganex.levels is {config.levels}; expected 6, 7 or 8")
         self.config = config
-        self.magnification = 2 ** (config.levels - 6)
+        self.levels = trained_levels if config.levels is None else config.levels
+        """Generator levels run."""
+        self.magnification = 2 ** (self.levels - 6)
         """Output px per input px."""
         self._load, self._compile = load, compile_clip
         self._network: Network | None = None
@@ -119,7 +126,7 @@ class Engine:
             network = self._loaded()
             # As published, of several editing vectors the first one counts.
             edit = {"edit": self.config.edit * network.editing_w[:1]} if len(network.editing_w) else {}
-            self._clip = key, self._compile(network, w_plus, dtype=dtype, levels=self.config.levels, **edit)
+            self._clip = key, self._compile(network, w_plus, dtype=dtype, levels=self.levels, **edit)
             if self.config.codes != "each":
                 self._network = None  # 1.3 GB that the frames of a clip do not need
         return self._clip[1]

@@ -11,7 +11,7 @@ from toonifygb.stylize.styleganex.aligned import AlignedStylizer
 from toonifygb.stylize.styleganex.engine import Engine
 from toonifygb.stylize.styleganex.fast import compile_clip
 from toonifygb.stylize.styleganex.stylizer import StyleganexStylizer
-from toonifygb.stylize.styleganex.weights import load
+from toonifygb.stylize.styleganex.weights import load, trained_levels
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -66,7 +66,7 @@ def open_file(path: Path, config: StyleganexConfig) -> Stylizer:
 
 
 def _stylizer(name: str, description: str, path: Path, config: StyleganexConfig) -> Stylizer:
-    engine = Engine(partial(load, path), compile_clip, config)
+    engine = Engine(partial(load, path), compile_clip, config, trained_levels(path))
     kind = AlignedStylizer if config.framing == "aligned" else StyleganexStylizer
     return kind(name, description, engine)
 

@@ -1,7 +1,8 @@
 """Weights on disk: our safetensors files, and how the authors' checkpoints become such files.
 
 A file holds the state dict, ``latent_avg``, for edit networks ``editing_w``, and in its metadata the format's name
-and version and the variant as JSON. Nothing is ever skipped in silence: a missing or surplus key is an error.
+and version, the variant as JSON, and the levels it was trained with where these are not all. Nothing is ever
+skipped in silence: a missing or surplus key is an error.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from toonifygb.assets.convert import Checkpoint, StoredTensor
 from toonifygb.atomic import replacing
 from toonifygb.errors import AssetError
 from toonifygb.progress import SILENT
+from toonifygb.stylize.styleganex.generator import N_LEVELS
 from toonifygb.stylize.styleganex.layers import binomial_kernel, fir_kernel
 from toonifygb.stylize.styleganex.network import StyleGANEX
 from toonifygb.stylize.styleganex.variants import N_CODES, STYLE_WIDTH, Variant, infer_variant
@@ -68,22 +70,44 @@ def load(path: Path) -> StyleGANEX:
             variant = _read_variant(metadata, path)
             tensors = {key: file.get_tensor(key) for key in file.keys()}
     except SafetensorError as error:
-        raise AssetError(f"{path} is damaged ({error})", "convert or download it again") from error
+        raise _damaged(path, error) from error
     latent_avg, editing_w = tensors.pop("latent_avg", None), tensors.pop("editing_w", None)
     if latent_avg is None:
         raise AssetError(f"{path} lacks latent_avg", "convert it again")
     return assembled(variant, tensors, latent_avg, editing_w, path)
 
 
-def save(network: StyleGANEX, path: Path) -> None:
-    """Writes a network so that ``load`` gives it back; the file appears when it is complete."""
+def trained_levels(path: Path) -> int:
+    """How many levels of the generator stored at ``path`` were trained: 8, or 7 or 6 in styles of one's own.
+
+    Raises:
+        AssetError: the file is damaged.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            text = (file.metadata() or {}).get("levels", str(N_LEVELS))
+    except SafetensorError as error:
+        raise _damaged(path, error) from error
+    if text not in ("6", "7", "8"):
+        raise AssetError(f"{path} says it was trained with {text!r} levels; expected 6, 7 or 8", "train it again")
+    return int(text)
+
+
+def save(network: StyleGANEX, path: Path, *, levels: int = N_LEVELS) -> None:
+    """Writes a network so that ``load`` gives it back; the file appears when it is complete.
+
+    Args:
+        network: to store.
+        path: the file.
+        levels: of its generator that were trained; ``trained_levels`` gives them back.
+    """
     tensors = {key: value.detach().clone().contiguous() for key, value in network.state_dict().items()}
     tensors["latent_avg"] = network.latent_avg.clone()
     if len(network.editing_w):
         tensors["editing_w"] = network.editing_w.clone()
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
-        save_file(tensors, temporary, _metadata(network.variant, "saved"))
+        save_file(tensors, temporary, _metadata(network.variant, "saved") | {"levels": str(levels)})
 
 
 def convert_checkpoint(source: Path, target: Path, *, progress: Progress = SILENT) -> None:
@@ -243,6 +267,10 @@ def _read_variant(metadata: Mapping[str, str], path: Path) -> Variant:
     if not isinstance(given, dict) or {key: type(value) for key, value in given.items()} != types:
         raise AssetError(f"{path} names no variant of StyleGANEX in its metadata", "convert it again")
     return replace(variant, **given)
+
+
+def _damaged(path: Path, error: Exception) -> AssetError:
+    return AssetError(f"{path} is damaged ({error})", "convert or download it again")
 
 
 def _listed(keys: list[str]) -> str:
