@@ -7,8 +7,11 @@ fewer steps: what would hardly move in so few (delta positions and opacities) ta
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import torch
+
+from toonifygb.avatar.bases import Mixer
 from toonifygb.avatar.fields import FIELDS, each, rows, width
 from toonifygb.structures import GaussianParams
 
@@ -45,6 +48,10 @@ Held-out score of a clip whose end turns away from the rest: +0.9 dB."""
 MEANS_DECAY = 0.01
 """Final over first rate of the neutral positions; log-linear over the first ``DECAY_SHARE`` of the steps."""
 DECAY_SHARE = 0.75
+LEARNED = ("linear", "hidden", "bias", "out")
+"""Fields of a mixer that are trained."""
+MIXER_RATE = 1e-3
+MIXER_EPS = 1e-8
 SETTLE_FROM, SETTLE_TO = 0.6, 0.1
 """From this share of the steps on all rates fall, log-linear, to this share of themselves: it quiets the noise of
 single-image steps."""
@@ -56,6 +63,8 @@ class Coefficients:
 
     expression: Float[Tensor, " e"]
     driver: Float[Tensor, " d"]
+    psi: Float[Tensor, " k"]
+    """All of the frame, from which a mixer makes ``expression``."""
 
 
 def blend(state: TrainState, psi: Coefficients, kernels: Kernels) -> GaussianParams:
@@ -89,6 +98,10 @@ class Optimizer:
         self._neutral = _rates(state.neutral.values, NEUTRAL_RATES)
         self._expression = _rates(state.expression.values, delta)
         self._driver = _rates(state.driver.values, delta)
+        self._mixer = {}
+        if state.mixer is not None:
+            learned = {name: getattr(state.mixer.values, name).view(-1) for name in LEARNED}
+            self._mixer = {name: torch.full_like(values, MIXER_RATE) for name, values in learned.items()}
 
     def step(self, state: TrainState, gradient: GaussianParams, psi: Coefficients) -> None:
         """One Adam step.
@@ -100,6 +113,8 @@ class Optimizer:
         """
         settle = settling(state.step / self._steps)
         means = means_decay(state.step / self._steps)
+        if state.mixer is not None:
+            self._mixer_step(state, gradient, psi, settle)
         for name, g in each(gradient):
             factor = means if name == "means" else settle
             values, first, second = _parts(state.neutral, name)
@@ -136,6 +151,36 @@ class Optimizer:
                     skip_inactive=True,
                 )
 
+    def _mixer_step(self, state: TrainState, gradient: GaussianParams, psi: Coefficients, settle: float) -> None:
+        """Adam on the network that weighs the bases; the derivative by a basis' weight is its product with g."""
+        assert state.mixer is not None
+        by_weight = torch.zeros_like(psi.expression)
+        for name, bases in each(state.expression.values):
+            matrix = rows(bases)
+            by_weight += matrix @ getattr(gradient, name).reshape(-1)[: matrix.shape[1]]
+        slope = mixer_gradient(state.mixer.values, psi.psi, by_weight)
+        for name in LEARNED:
+            values, first, second = (part.view(-1) for part in _parts(state.mixer, name))
+            found = getattr(slope, name).reshape(-1)
+            self._kernels.adam_step(
+                values, first, second, found, self._mixer[name], state.step, factor=settle, eps=MIXER_EPS
+            )
+
+
+def mixer_gradient(mixer: Mixer, psi: Float[Tensor, " k"], by_weight: Float[Tensor, " b"]) -> Mixer:
+    """Derivative by the network's parameters, from that by its weights w."""
+    x = psi / mixer.scale
+    bent, rest = (mixer.hidden @ x + mixer.bias).tanh(), mixer.bias.tanh()
+    by_bent = by_weight @ mixer.out
+    by_hidden = by_bent * (1 - bent.square())
+    return Mixer(
+        scale=torch.zeros_like(mixer.scale),
+        linear=torch.outer(by_weight, x),
+        hidden=torch.outer(by_hidden, x),
+        bias=by_hidden - by_bent * (1 - rest.square()),
+        out=torch.outer(by_weight, bent - rest),
+    )
+
 
 def means_decay(share: float) -> float:
     """Factor on the rate of the neutral positions after a share 0..1 of the steps."""
@@ -147,7 +192,7 @@ def settling(share: float) -> float:
     return SETTLE_TO ** max(0.0, (share - SETTLE_FROM) / (1 - SETTLE_FROM))
 
 
-def _parts(trained: Trained, name: str) -> tuple[Tensor, Tensor, Tensor]:
+def _parts(trained: Trained[Any], name: str) -> tuple[Tensor, Tensor, Tensor]:
     return getattr(trained.values, name), getattr(trained.first, name), getattr(trained.second, name)
 
 
