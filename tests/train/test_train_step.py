@@ -13,6 +13,7 @@ from make import TINY, tiny_avatar, tiny_head, tiny_sequence
 
 from toonifygb import render
 from toonifygb.avatar import Avatar, MouthVolume
+from toonifygb.avatar.bases import Mixer
 from toonifygb.avatar.fields import FIELDS, join
 from toonifygb.avatar.skinning import activate, scale_deltas
 from toonifygb.errors import InputError
@@ -21,12 +22,27 @@ from toonifygb.structures import GaussianParams, TrackedSequence
 from toonifygb.train import Dataset, build_dataset, evaluate, first_avatar, train
 from toonifygb.train.densify import DensifyRules
 from toonifygb.train.losses import LossWeights, image_loss, mouth_loss
-from toonifygb.train.optim import DELTA_EPS, DELTA_RATES, FULL_STEPS, NEUTRAL_RATES, means_decay, settling
+from toonifygb.train.optim import (
+    DELTA_EPS,
+    DELTA_RATES,
+    FULL_STEPS,
+    LEARNED,
+    MIXER_EPS,
+    MIXER_RATE,
+    NEUTRAL_RATES,
+    means_decay,
+    mixer_gradient,
+    settling,
+)
 from toonifygb.train.state import TrainState, read_checkpoint, write_checkpoint
 from toonifygb.train.step import Stepper
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from toonifygb.config import TrainConfig
+
+REDUCED = replace(TINY, blendshapes="reduced", n_bases=4)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +65,10 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, TrackedSequ
 
 def same(a: Avatar, b: Avatar) -> bool:
     names = ("neutral", "deltas", "mouth_upper", "mouth_lower")
-    return all(torch.equal(getattr(getattr(a, n), f), getattr(getattr(b, n), f)) for n in names for f in FIELDS)
+    records = [(getattr(a, n), getattr(b, n), FIELDS) for n in names]
+    assert (a.mixer is None) == (b.mixer is None)
+    records += [] if a.mixer is None else [(a.mixer, b.mixer, LEARNED)]
+    return all(torch.equal(getattr(left, f), getattr(right, f)) for left, right, parts in records for f in parts)
 
 
 class PlainTraining:
@@ -58,10 +77,9 @@ class PlainTraining:
     def __init__(self, template: Avatar) -> None:
         self.state = TrainState.start(template, TINY.seed)
         self.template = template
-        n_expression = template.n_expressions + template.n_eyelids
-        self.scale = torch.ones(len(template.blendshape_names), self.state.counts.face)
-        self.scale[:n_expression] = 0.0
-        self.scale[:n_expression, : self.state.counts.moved] = self.state.scale
+        self.scale = torch.ones(len(template.deltas.means), self.state.counts.face)
+        self.scale[: template.n_bases] = 0.0
+        self.scale[: template.n_bases, : self.state.counts.moved] = self.state.scale
         sets = [template.neutral, template.mouth_upper, template.mouth_lower]
         self.sets = [part.map(lambda t: t.clone().requires_grad_()) for part in sets]
         self.trained = template.deltas.map(lambda t: torch.zeros_like(t).requires_grad_())
@@ -71,6 +89,9 @@ class PlainTraining:
             faster = FULL_STEPS / TINY.steps if name in {"means", "opacity_logits"} else 1
             self.add([getattr(part, name) for part in self.sets], NEUTRAL_RATES[key], name != "means", 1e-15)
             self.add([getattr(self.trained, name)], DELTA_RATES[key] * faster, True, DELTA_EPS)
+        self.mixer = None if template.mixer is None else template.mixer.map(lambda t: t.clone().requires_grad_())
+        if self.mixer is not None:
+            self.add([getattr(self.mixer, name) for name in LEARNED], MIXER_RATE, True, MIXER_EPS)
         self.adam = torch.optim.Adam([dict(group) for group in self.groups])
         self.volume = MouthVolume.around(join([template.mouth_upper, template.mouth_lower]).means)
 
@@ -97,7 +118,8 @@ class PlainTraining:
         index = self.state.next_frame(dataset.split.train)
         self.state.step += 1
         neutral, upper, lower = self.sets
-        avatar = replace(self.template, neutral=neutral, mouth_upper=upper, mouth_lower=lower, deltas=self.deltas())
+        sets = {"neutral": neutral, "mouth_upper": upper, "mouth_lower": lower, "deltas": self.deltas()}
+        avatar = replace(self.template, **sets, mixer=self.mixer)
         image = render.get("auto", 1).render(
             avatar.pose(sequence.motion[index]), dataset.camera(index), sh_degree=0
         )
@@ -118,10 +140,11 @@ class DegreeZero(Stepper):
     sh_degree = 0  # type: ignore[assignment]
 
 
-def test_fast_step_equals_the_plain_one(clip: tuple[Dataset, TrackedSequence]) -> None:
+@pytest.mark.parametrize("config", [TINY, REDUCED], ids=["full", "reduced"])
+def test_fast_step_equals_the_plain_one(clip: tuple[Dataset, TrackedSequence], config: TrainConfig) -> None:
     """Two steps, every parameter."""
     dataset, sequence = clip
-    template = first_avatar(dataset, sequence, tiny_head(), TINY)
+    template = first_avatar(dataset, sequence, tiny_head(), config)
     # Round Gaussians have no gradient for their rotation, and unturned ones none for w, but rounding noise, of
     # which Adam keeps the sign.
     stretched = template.neutral.log_scales + torch.tensor([0.4, 0.0, -0.4])
@@ -133,7 +156,7 @@ def test_fast_step_equals_the_plain_one(clip: tuple[Dataset, TrackedSequence]) -
     for _ in range(2):
         stepper.step()
         plain.step(dataset, sequence)
-    n_face, n_expression = state.counts.face, template.n_expressions + template.n_eyelids
+    n_face, n_expression = state.counts.face, template.n_bases
     wanted, applied = join(plain.sets), plain.deltas()
     groups = {
         "neutral": (state.neutral.values, wanted, first, n_face),
@@ -158,17 +181,48 @@ def test_fast_step_equals_the_plain_one(clip: tuple[Dataset, TrackedSequence]) -
             wrong = ((moved - expected).abs() > 0.02 * expected.abs().max()).float().mean()
             assert wrong < 0.02, (group, name, float(wrong))
             assert (expected != 0).any(), (group, name)
+    if state.mixer is None or plain.mixer is None:
+        assert config is TINY
+        return
+    for name in LEARNED:
+        origin, ours, theirs = (
+            getattr(mixer, name).detach() for mixer in (template.mixer, state.mixer.values, plain.mixer)
+        )
+        # Adam's first steps are ± the rate: where a gradient is nearly 0, float32 may choose the other sign.
+        wrong = ((ours - theirs).abs() > 0.05 * MIXER_RATE).float().mean()
+        assert wrong < 0.05, (name, float(wrong))
+        assert not torch.equal(origin, ours), name
 
 
-@pytest.mark.parametrize("grow", [False, True])
+def test_slope_of_the_network_equals_autograd() -> None:
+    """Random weights, coefficients and slopes, in double precision."""
+    generator = torch.Generator().manual_seed(2)
+    sizes = {"scale": (6,), "linear": (4, 6), "hidden": (8, 6), "bias": (8,), "out": (4, 8)}
+    values = {
+        name: torch.rand(size, generator=generator, dtype=torch.float64) + 0.1 for name, size in sizes.items()
+    }
+    psi, by_weight = torch.randn(2, 6, generator=generator, dtype=torch.float64)
+    by_weight = by_weight[:4]
+    mixer = Mixer(**{name: value.requires_grad_(name != "scale") for name, value in values.items()})
+    wanted = torch.autograd.grad(mixer(psi), [getattr(mixer, name) for name in LEARNED], by_weight)
+    found = mixer_gradient(mixer.detach(), psi, by_weight)
+    for name, expected in zip(LEARNED, wanted, strict=True):
+        assert torch.allclose(getattr(found, name), expected), name
+
+
+@pytest.mark.parametrize(("grow", "base"), [(False, TINY), (True, TINY), (True, REDUCED)])
 def test_resumed_training_equals_a_straight_one(
-    clip: tuple[Dataset, TrackedSequence], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grow: bool
+    clip: tuple[Dataset, TrackedSequence],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    grow: bool,
+    base: TrainConfig,
 ) -> None:
     dataset, sequence = clip
     # A new generation every three steps, one of them between the checkpoint and its resumption.
     eager = DensifyRules(first=0.1, last=0.9, every=3, face_threshold=1e-5, mouth_threshold=1e-5)
     monkeypatch.setattr("toonifygb.train.densify.DensifyRules", lambda: eager)
-    config = replace(TINY, steps=20, densify=grow)
+    config = replace(base, steps=20, densify=grow)
 
     class StopAt:
         def __init__(self, step: int) -> None:
@@ -231,11 +285,12 @@ def test_every_epoch_takes_each_frame_once(clip: tuple[Dataset, TrackedSequence]
     assert epochs[0] != epochs[1]
 
 
-def test_training_learns(clip: tuple[Dataset, TrackedSequence], tmp_path: Path) -> None:
+@pytest.mark.parametrize("config", [TINY, REDUCED], ids=["full", "reduced"])
+def test_training_learns(clip: tuple[Dataset, TrackedSequence], tmp_path: Path, config: TrainConfig) -> None:
     """The loss falls and the score on frames never trained on rises by several decibels."""
     dataset, sequence = clip
-    before = first_avatar(dataset, sequence, tiny_head(), TINY)
-    after = train(dataset, sequence, tiny_head(), replace(TINY, steps=250), tmp_path)
+    before = first_avatar(dataset, sequence, tiny_head(), config)
+    after = train(dataset, sequence, tiny_head(), replace(config, steps=250), tmp_path)
     scores = [evaluate(a, dataset, sequence, dataset.split.test) for a in (before, after)]
     assert scores[1]["psnr"] > scores[0]["psnr"] + 4
     assert scores[1]["ssim"] > scores[0]["ssim"] + 0.05
