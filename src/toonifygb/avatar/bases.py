@@ -33,24 +33,25 @@ HIDDEN = 64
 """Hidden units of the network."""
 LEAST_USE = 0.25
 """Share of the head model's σ that a coefficient counts as used at least: it can be driven beyond the clip."""
-EYELID_SIGMA = 0.5
+EYELID_USE = 0.5
+"""The same for the lids: they are few Gaussians that seldom move, and a head that cannot blink looks dead."""
 _TURNS = 200
 _STILL = 1e-6
 
 
 @dataclass(frozen=True)
 class Mixer(TensorRecord):
-    """Weights of b bases from x coefficients: w = L x + O (tanh(H x + a) - tanh(a)), x = ψ / scale.
+    """Weights of b bases from k coefficients: w = L x_own + O (tanh(H x + a) - tanh(a)), x = ψ / scale.
 
     No expression in the mean pose, ψ = 0, gives w = 0 whatever is learned: the neutral stays the neutral. Outside
     the trained range the bounded part keeps its value and the linear one goes on, as blendshapes do.
     """
 
-    scale: Float[Tensor, " x"]
+    scale: Float[Tensor, " k"]
     """Usual size of every coefficient; not trained."""
-    linear: Float[Tensor, "b x"]
-    """L."""
-    hidden: Float[Tensor, "h x"]
+    linear: Float[Tensor, "b e"]
+    """L: the head model's own blendshapes, expression and eyelids, in terms of the bases; not trained either."""
+    hidden: Float[Tensor, "h k"]
     """H."""
     bias: Float[Tensor, " h"]
     """a."""
@@ -62,11 +63,11 @@ class Mixer(TensorRecord):
         """Number of weights."""
         return self.linear.shape[0]
 
-    def __call__(self, psi: Float[Tensor, "*t x"]) -> Float[Tensor, "*t b"]:
+    def __call__(self, psi: Float[Tensor, "*t k"]) -> Float[Tensor, "*t b"]:
         """Weights of the bases for the coefficients ψ of expression, eyelids and pose drivers."""
         x = psi / self.scale
         bent = (x @ self.hidden.mT + self.bias).tanh() - self.bias.tanh()
-        return x @ self.linear.mT + bent @ self.out.mT
+        return x[..., : self.linear.shape[1]] @ self.linear.mT + bent @ self.out.mT
 
 
 def check_bases(config: TrainConfig, head: HeadModel) -> None:
@@ -98,8 +99,8 @@ def reduced(avatar: Avatar, head: HeadModel, config: TrainConfig, motion: HeadMo
     """
     n_own = avatar.n_expressions + avatar.n_eyelids
     n_bases = min(config.n_bases or N_BASES, n_own)
-    lids = head.expression_sigma.new_full((avatar.n_eyelids,), EYELID_SIGMA)
-    scale = LEAST_USE * torch.cat([head.expression_sigma[: avatar.n_expressions], lids])
+    lids = head.expression_sigma.new_full((avatar.n_eyelids,), EYELID_USE)
+    scale = torch.cat([LEAST_USE * head.expression_sigma[: avatar.n_expressions], lids])
     if motion is not None:
         scale = scale.maximum(avatar.signals(motion)[:, :n_own].square().mean(0).sqrt())
     turn = _directions(scale[:, None, None] * avatar.deltas.means[:n_own], n_bases)
@@ -119,7 +120,7 @@ def _first_mixer(turn: Float[Tensor, "b k"], scale: Float[Tensor, " k"], avatar:
     n_inputs = len(scale) + n_drivers
     return Mixer(
         scale=torch.cat([scale, scale.new_ones(n_drivers)]),
-        linear=torch.cat([turn, turn.new_zeros(len(turn), n_drivers)], dim=1),
+        linear=turn,
         hidden=torch.randn(HIDDEN, n_inputs, generator=generator) / n_inputs**0.5,
         bias=2 * torch.rand(HIDDEN, generator=generator) - 1,
         out=torch.zeros(len(turn), HIDDEN),

@@ -228,7 +228,7 @@ def _check_sizes(avatar: Avatar, facts: dict[str, Any], path: Path) -> None:
         mixer, n_hidden = avatar.mixer, len(avatar.mixer.bias)
         expected |= {
             "mixer.scale": (mixer.scale, (n_psi,)),
-            "mixer.linear": (mixer.linear, (mixer.n_bases, n_psi)),
+            "mixer.linear": (mixer.linear, (mixer.n_bases, n_psi - n_drivers)),
             "mixer.hidden": (mixer.hidden, (n_hidden, n_psi)),
             "mixer.out": (mixer.out, (mixer.n_bases, n_hidden)),
         }
