@@ -1,21 +1,75 @@
-"""The parts of a training step in the draft setting: 15k Gaussians, 20 blendshapes, 256 px, SH degree 1."""
+"""A training step: its parts in the draft setting, and all of it, as training takes it, in the paper's.
+
+Draft: 15k Gaussians, 20 blendshapes, 256 px, SH degree 1. Paper: 64k Gaussians, all blendshapes of the open head,
+512 px; on it the step's floor is the memory traffic of blending and of Adam over the pairs (Gaussian, blendshape)
+that move, plus the arithmetic of compositing (``benchmarks.rasterizer`` has that one's floor).
+"""
 
 from __future__ import annotations
+
+import dataclasses
 
 import torch
 
 from benchmarks import limits, scenes
-from benchmarks.harness import Figure, cpu_seconds
-from toonifygb import render
+from benchmarks.gpu import scene
+from benchmarks.harness import Figure, cpu_seconds, wall_seconds
+from toonifygb import head, render
+from toonifygb.avatar.fields import each
+from toonifygb.config import PAPER
 from toonifygb.render.fused import ReferenceKernels
+from toonifygb.render.native import available_threads
 from toonifygb.structures import GaussianParams
+from toonifygb.threads import one_torch_thread
+from toonifygb.train.state import TrainState
+from toonifygb.train.step import Stepper
 
 K, WIDTHS = 20, (3, 4, 3, 1, 12)
 ADAM_BYTES, BLEND_BYTES = 24, 4
 """Memory traffic per delta: read and write it and its two moments; read it once."""
 
 
+FRAMES = 16
+PAPER_STEP_MS = 1e3 * 44 * 60 / 40_000
+"""A step of the paper's 40 000 in 44 minutes on an RTX 4090, everything included."""
+
+
 def run() -> list[Figure]:
+    """Processor time of each part in the draft setting, and whole steps in the paper's."""
+    return parts() + [whole_step(degree) for degree in (1, 3)]
+
+
+def whole_step(degree: int) -> Figure:
+    """Wall time of one step of the paper's regime on all cores, beside the paper's own."""
+    config = dataclasses.replace(PAPER, sh_degree=degree)
+    avatar = scene.avatar(config.n_gaussians, config.n_mouth_gaussians, degree, config.resolution)
+    threads = available_threads()
+    with one_torch_thread():
+        state = TrainState.start(avatar, 0)
+        state.step = config.steps // 2  # the full SH degree is active
+        stepper = Stepper(
+            state,
+            avatar,
+            scene.noise_dataset(FRAMES, config.resolution),
+            scene.sequence(head.load("open"), FRAMES, config.resolution),
+            config,
+            render.get("native", threads),
+            render.kernels("native", threads),
+        )
+        seconds = wall_seconds(stepper.step, budget=10.0)
+    floor = step_bytes(state) / limits.bandwidth()
+    name = f"{avatar.n // 1000}k, K={len(avatar.blendshape_names)}, SH {degree}, {config.resolution} px: whole step"
+    return Figure(f"{name}, {threads} threads, wall", 1e3 * seconds, "ms", PAPER_STEP_MS, 1e3 * floor)
+
+
+def step_bytes(state: TrainState) -> float:
+    """Least memory traffic of blending and of Adam: pairs that move are read once, then read and written thrice."""
+    per_gaussian = sum(tensor[0].numel() for _, tensor in each(state.neutral.values))
+    pairs = int((state.scale != 0).sum()) + len(state.driver.values.means) * state.counts.face
+    return (ADAM_BYTES + BLEND_BYTES) * per_gaussian * pairs
+
+
+def parts() -> list[Figure]:
     """Processor time of each part and of all of them together, one thread."""
     torch.set_num_threads(1)
     splats, camera = scenes.head(12_000, 3_000, degree=1), scenes.camera(256)

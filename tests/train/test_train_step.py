@@ -21,7 +21,7 @@ from toonifygb.progress import Stopped
 from toonifygb.structures import GaussianParams, TrackedSequence
 from toonifygb.train import Dataset, build_dataset, evaluate, first_avatar, train
 from toonifygb.train.densify import DensifyRules
-from toonifygb.train.losses import LossWeights, image_loss, mouth_loss
+from toonifygb.train.losses import LossWeights, image_loss, mouth_loss, placed_on
 from toonifygb.train.optim import (
     DELTA_EPS,
     DELTA_RATES,
@@ -116,15 +116,17 @@ class PlainTraining:
 
     def step(self, dataset: Dataset, sequence: TrackedSequence) -> None:
         index = self.state.next_frame(dataset.split.train)
+        background = self.state.next_background()
         self.state.step += 1
         neutral, upper, lower = self.sets
         sets = {"neutral": neutral, "mouth_upper": upper, "mouth_lower": lower, "deltas": self.deltas()}
         avatar = replace(self.template, **sets, mixer=self.mixer)
         image = render.get("auto", 1).render(
-            avatar.pose(sequence.motion[index]), dataset.camera(index), sh_degree=0
+            avatar.pose(sequence.motion[index]), dataset.camera(index), background=background, sh_degree=0
         )
         weights = LossWeights.of(TINY)
-        loss = image_loss(image, *dataset.target(index), weights)
+        color, matte = dataset.target(index)
+        loss = image_loss(image, placed_on(background, color, matte), matte, weights)
         loss = loss + mouth_loss(upper.means, lower.means, self.volume, weights)
         self.adam.zero_grad()
         loss.backward()

@@ -58,6 +58,18 @@ class LossTerms:
         return self.photo + self.alpha + self.mouth
 
 
+def placed_on(
+    background: Float[Tensor, " 3"], color: Float[Tensor, "h w 3"], matte: Float[Tensor, "h w"]
+) -> Float[Tensor, "h w 3"]:
+    """The picture of a head cut out on black, on another background.
+
+    Training draws a new one at every step. On black alone a dark Gaussian and none at all look the same, and
+    Gaussians at the outline turn dark, which shows as soon as they are seen from another side. Measured on a
+    synthetic person: +0.18 dB on the held-out frames, all of them on black.
+    """
+    return torch.addcmul(color, (1 - matte)[..., None], background)
+
+
 def image_loss(
     rendering: Rendering, target: Float[Tensor, "h w 3"], matte: Float[Tensor, "h w"], weights: LossWeights
 ) -> Float[Tensor, ""]:

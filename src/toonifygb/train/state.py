@@ -149,6 +149,10 @@ class TrainState:
         self.position += 1
         return int(self.order[self.position - 1])
 
+    def next_background(self) -> Float[Tensor, " 3"]:
+        """The colour behind the next training frame, RGB 0..1, drawn at random; on the processor."""
+        return torch.rand(3, generator=self.generator)
+
     def avatar(self, template: Avatar) -> Avatar:
         """The avatar that the parameters make of ``template``; everything is copied."""
         counts, values = self.counts, self.neutral.values.map(torch.clone)

@@ -17,7 +17,7 @@ from toonifygb.avatar.fields import cut, join
 from toonifygb.avatar.skinning import pose_offsets
 from toonifygb.render import RenderInfo
 from toonifygb.structures import GaussianParams, Rendering, Splats
-from toonifygb.train.losses import LossTerms, LossWeights, image_gradients, mouth_loss
+from toonifygb.train.losses import LossTerms, LossWeights, image_gradients, mouth_loss, placed_on
 from toonifygb.train.optim import Coefficients, Optimizer, blend
 from toonifygb.train.state import Counts
 
@@ -118,8 +118,9 @@ class Stepper:
         """One step on the next frame; ``info`` is filled with the densification statistic when given."""
         state = self.state
         index = state.next_frame(self._dataset.split.train)
+        background = state.next_background().to(self._kernels.device)
         state.step += 1
-        gradient, terms = self._gradient(index, info)
+        gradient, terms = self._gradient(index, background, info)
         self._optimizer.step(state, gradient, self._frame(index).psi)
         return terms
 
@@ -131,7 +132,13 @@ class Stepper:
         """The same for any motion, no batch axis."""
         return self._posed(self._motion(motion))[1].to("cpu")
 
-    def pull(self, index: int, errors: ImageErrors, info: RenderInfo | None = None) -> Pull:
+    def pull(
+        self,
+        index: int,
+        errors: ImageErrors,
+        info: RenderInfo | None = None,
+        background: Float[Tensor, " 3"] | None = None,
+    ) -> Pull:
         """How errors of one frame's picture pull at the Gaussians.
 
         Args:
@@ -139,13 +146,16 @@ class Stepper:
             errors: the rendering, colours and matte of the frame → derivatives of some loss by the rendering's
                 colour and opacity.
             info: filled with the densification statistic when given.
+            background: what is rendered behind the Gaussians; black when ``None``.
         """
         frame = self._frame(index)
         raw, splats = self._posed(frame)
         leaves = _leaves(splats)
         cut_off = Splats(*leaves, sh_frames=splats.sh_frames)
         camera = self._dataset.camera(index)
-        rendering = self._renderer.render(cut_off, camera, sh_degree=self.sh_degree, info=info)
+        rendering = self._renderer.render(
+            cut_off, camera, background=background, sh_degree=self.sh_degree, info=info
+        )
         slopes = errors(rendering, *self._dataset.target(index, self._kernels.device))
         world = Splats(*torch.autograd.grad([rendering.color, rendering.alpha], leaves, slopes))
         return Pull(
@@ -173,17 +183,20 @@ class Stepper:
         raw.means[: self.state.counts.face].add_(pose_offsets(frame.features, self.state.pose_basis))
         return raw, self._kernels.skin(raw, self.state.skin_weights, frame.transforms)
 
-    def _gradient(self, index: int, info: RenderInfo | None) -> tuple[GaussianParams, LossTerms]:
+    def _gradient(
+        self, index: int, background: Float[Tensor, " 3"], info: RenderInfo | None
+    ) -> tuple[GaussianParams, LossTerms]:
         """Gradient of the whole objective for the blended raw parameters of one frame."""
         terms = LossTerms(0.0, 0.0, 0.0)
 
         def errors(rendering: Rendering, target: Tensor, matte: Tensor) -> tuple[Tensor, Tensor]:
+            target = placed_on(background, target, matte)
             terms.photo, terms.alpha, v_color, v_alpha = image_gradients(
                 rendering, target, matte, self._weights, self._kernels
             )
             return v_color, v_alpha
 
-        gradient = self.pull(index, errors, info).raw
+        gradient = self.pull(index, errors, info, background).raw
         terms.mouth = self._add_mouth_gradient(gradient)
         return gradient, terms
 
