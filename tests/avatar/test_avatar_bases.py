@@ -172,3 +172,13 @@ def test_a_number_of_bases_that_cannot_be_is_refused(kind: str, number: int, mos
         check_bases(config, tiny_head())
     with pytest.raises(InputError):
         init_avatar(tiny_head(), SHAPE, config)
+
+
+def test_heads_without_lids_have_bases_too() -> None:
+    head = replace(tiny_head(), eyelid_basis=None, n_blendshapes=3)
+    config = replace(TINY, blendshapes="reduced")
+    avatar = init_avatar(head, SHAPE, config, motion=MOTION)
+    assert avatar.n_bases == 3 and avatar.deltas.means.shape[0] == 3 + 7
+    assert avatar.coefficients(MOTION).shape == (20, 10)
+    with pytest.raises(InputError, match="has 3 blendshapes"):
+        check_bases(replace(config, n_bases=4), head)
