@@ -23,6 +23,7 @@ from toonifygb.train import Dataset, build_dataset, evaluate, first_avatar, trai
 from toonifygb.train.densify import DensifyRules
 from toonifygb.train.losses import LossWeights, image_loss, mouth_loss, placed_on
 from toonifygb.train.optim import (
+    BASIS_EPS,
     DELTA_EPS,
     DELTA_RATES,
     FULL_STEPS,
@@ -82,13 +83,20 @@ class PlainTraining:
         self.scale[: template.n_bases, : self.state.counts.moved] = self.state.scale
         sets = [template.neutral, template.mouth_upper, template.mouth_lower]
         self.sets = [part.map(lambda t: t.clone().requires_grad_()) for part in sets]
-        self.trained = template.deltas.map(lambda t: torch.zeros_like(t).requires_grad_())
+        self.parts = [slice(0, template.n_bases), slice(template.n_bases, None)]
+        self.trained = [
+            template.deltas.map(lambda t, rows=rows: torch.zeros_like(t[rows]).requires_grad_())
+            for rows in self.parts
+        ]
         self.groups = []
         for name in FIELDS:
             key = "sh_dc" if name == "sh" else name
             faster = FULL_STEPS / TINY.steps if name in {"means", "opacity_logits"} else 1
             self.add([getattr(part, name) for part in self.sets], NEUTRAL_RATES[key], name != "means", 1e-15)
-            self.add([getattr(self.trained, name)], DELTA_RATES[key] * faster, True, DELTA_EPS)
+            for part, eps in zip(
+                self.trained, (DELTA_EPS if template.mixer is None else BASIS_EPS, DELTA_EPS), strict=True
+            ):
+                self.add([getattr(part, name)], DELTA_RATES[key] * faster, True, eps)
         self.mixer = None if template.mixer is None else template.mixer.map(lambda t: t.clone().requires_grad_())
         if self.mixer is not None:
             self.add([getattr(self.mixer, name) for name in LEARNED], MIXER_RATE, True, MIXER_EPS)
@@ -99,20 +107,19 @@ class PlainTraining:
         self.groups.append({"params": tensors, "lr": rate, "settles": settles, "eps": eps})
 
     def deltas(self) -> GaussianParams:
-        fixed = self.template.deltas
-        return GaussianParams(**{name: getattr(fixed, name) + getattr(self.trained, name) for name in FIELDS})
+        fixed, trained = self.template.deltas, join(self.trained)
+        return GaussianParams(**{name: getattr(fixed, name) + getattr(trained, name) for name in FIELDS})
 
     def damped_step(self) -> None:
         """Adam's step, of which the deltas take the share that blendshape consistency allows."""
-        before = self.trained.map(lambda t: t.detach().clone())
+        before = [part.map(lambda t: t.detach().clone()) for part in self.trained]
         self.adam.step()
         with torch.no_grad():
-            change = GaussianParams(
-                **{name: getattr(self.trained, name) - getattr(before, name) for name in FIELDS}
-            )
-            damped = scale_deltas(change, self.scale)
-            for name in FIELDS:
-                getattr(self.trained, name).copy_(getattr(before, name) + getattr(damped, name))
+            for part, old, rows in zip(self.trained, before, self.parts, strict=True):
+                change = GaussianParams(**{name: getattr(part, name) - getattr(old, name) for name in FIELDS})
+                damped = scale_deltas(change, self.scale[rows])
+                for name in FIELDS:
+                    getattr(part, name).copy_(getattr(old, name) + getattr(damped, name))
 
     def step(self, dataset: Dataset, sequence: TrackedSequence) -> None:
         index = self.state.next_frame(dataset.split.train)
