@@ -26,6 +26,7 @@ from toonifygb.train.optim import (
     BASIS_EPS,
     DELTA_EPS,
     DELTA_RATES,
+    DRIVER_TRAVEL,
     FULL_STEPS,
     LEARNED,
     MIXER_EPS,
@@ -93,10 +94,9 @@ class PlainTraining:
             key = "sh_dc" if name == "sh" else name
             faster = FULL_STEPS / TINY.steps if name in {"means", "opacity_logits"} else 1
             self.add([getattr(part, name) for part in self.sets], NEUTRAL_RATES[key], name != "means", 1e-15)
-            for part, eps in zip(
-                self.trained, (DELTA_EPS if template.mixer is None else BASIS_EPS, DELTA_EPS), strict=True
-            ):
-                self.add([getattr(part, name)], DELTA_RATES[key] * faster, True, eps)
+            own, driver = (getattr(part, name) for part in self.trained)
+            self.add([own], DELTA_RATES[key] * faster, True, DELTA_EPS if template.mixer is None else BASIS_EPS)
+            self.add([driver], DRIVER_TRAVEL[key] / TINY.steps, True, DELTA_EPS)
         self.mixer = None if template.mixer is None else template.mixer.map(lambda t: t.clone().requires_grad_())
         if self.mixer is not None:
             self.add([getattr(self.mixer, name) for name in LEARNED], MIXER_RATE, True, MIXER_EPS)
