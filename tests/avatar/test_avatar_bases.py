@@ -69,13 +69,17 @@ def test_few_bases_hold_as_much_as_any_could() -> None:
     assert energies[3:].sum() < 0.5 * energies.sum()
 
 
-def test_network_starts_as_the_projection_and_ignores_the_drivers() -> None:
+def test_network_starts_as_the_projection_and_never_sees_where_the_head_is() -> None:
     mixer = avatar_of(4).mixer
     assert mixer is not None
     assert torch.allclose(mixer.linear @ mixer.linear.T, torch.eye(4), atol=1e-5)
     psi = torch.randn(5, 13, generator=torch.Generator().manual_seed(0))
-    assert torch.allclose(mixer(psi), (psi / mixer.scale)[:, :6] @ mixer.linear.T)
-    assert (mixer.hidden[:, 6:] != 0).all()
+    assert torch.allclose(mixer(psi), (psi[:, :6] / mixer.scale[:6]) @ mixer.linear.T)
+    learned = trained(avatar_of(4)).mixer
+    assert learned is not None
+    moved = psi + torch.tensor([0.0] * 7 + [1.0] * 6)
+    assert torch.equal(learned(psi), learned(moved))
+    assert not torch.equal(learned(psi), learned(psi + torch.tensor([0.0] * 6 + [1.0] + [0.0] * 6)))
 
 
 def test_neutral_stays_neutral_whatever_is_learned() -> None:
@@ -83,7 +87,7 @@ def test_neutral_stays_neutral_whatever_is_learned() -> None:
     assert mixer is not None
     assert torch.equal(mixer(torch.zeros(13)), torch.zeros(3))
     far = 1e4 * torch.eye(13)
-    bent = mixer(far) - (far / mixer.scale)[:, :6] @ mixer.linear.T
+    bent = mixer(far) - (far[:, :6] / mixer.scale[:6]) @ mixer.linear.T
     assert bent.abs().max() <= 2 * mixer.out.abs().sum(1).max()
 
 

@@ -209,7 +209,7 @@ def test_slope_of_the_network_equals_autograd() -> None:
     values = {
         name: torch.rand(size, generator=generator, dtype=torch.float64) + 0.1 for name, size in sizes.items()
     }
-    psi, by_weight = torch.randn(2, 6, generator=generator, dtype=torch.float64)
+    psi, by_weight = torch.randn(2, 9, generator=generator, dtype=torch.float64)
     by_weight = by_weight[:4]
     mixer = Mixer(**{name: value.requires_grad_(name in LEARNED) for name, value in values.items()})
     wanted = torch.autograd.grad(mixer(psi), [getattr(mixer, name) for name in LEARNED], by_weight)

@@ -35,20 +35,23 @@ LEAST_USE = 0.25
 """Share of the head model's σ that a coefficient counts as used at least: it can be driven beyond the clip."""
 EYELID_USE = 0.5
 """The same for the lids: they are few Gaussians that seldom move, and a head that cannot blink looks dead."""
+N_DRIVERS_SEEN = 1
+"""The network looks at the first pose driver, how far the jaw is open; not at the head's place, which would
+only give it a way to learn single frames by heart."""
 _TURNS = 200
 _STILL = 1e-6
 
 
 @dataclass(frozen=True)
 class Mixer(TensorRecord):
-    """Weights of b bases from k coefficients: w = L x_own + O (tanh(H x + a) - tanh(a)), x = ψ / scale.
+    """Weights of b bases from the first k coefficients: w = L x_own + O (tanh(H x + a) - tanh(a)), x = ψ / scale.
 
     No expression in the mean pose, ψ = 0, gives w = 0 whatever is learned: the neutral stays the neutral. Outside
     the trained range the bounded part keeps its value and the linear one goes on, as blendshapes do.
     """
 
     scale: Float[Tensor, " k"]
-    """Usual size of every coefficient; not trained."""
+    """Usual size of every coefficient that is looked at: expression, eyelids, jaw opening; not trained."""
     linear: Float[Tensor, "b e"]
     """L: the head model's own blendshapes, expression and eyelids, in terms of the bases; not trained either."""
     hidden: Float[Tensor, "h k"]
@@ -63,9 +66,9 @@ class Mixer(TensorRecord):
         """Number of weights."""
         return self.linear.shape[0]
 
-    def __call__(self, psi: Float[Tensor, "*t k"]) -> Float[Tensor, "*t b"]:
+    def __call__(self, psi: Float[Tensor, "*t m"]) -> Float[Tensor, "*t b"]:
         """Weights of the bases for the coefficients ψ of expression, eyelids and pose drivers."""
-        x = psi / self.scale
+        x = psi[..., : len(self.scale)] / self.scale
         bent = (x @ self.hidden.mT + self.bias).tanh() - self.bias.tanh()
         return x[..., : self.linear.shape[1]] @ self.linear.mT + bent @ self.out.mT
 
@@ -89,7 +92,7 @@ def check_bases(config: TrainConfig, head: HeadModel) -> None:
 def reduced(avatar: Avatar, head: HeadModel, config: TrainConfig, motion: HeadMotion | None) -> Avatar:
     """An untrained avatar with few bases in the place of its expression and eyelid deltas.
 
-    Pose-driven deltas stay as they are, one per driver; the drivers are inputs of the network as well.
+    Pose-driven deltas stay as they are, one per driver.
 
     Args:
         avatar: untrained, with all blendshapes.
@@ -115,11 +118,11 @@ def reduced(avatar: Avatar, head: HeadModel, config: TrainConfig, motion: HeadMo
 
 def _first_mixer(turn: Float[Tensor, "b k"], scale: Float[Tensor, " k"], avatar: Avatar, seed: int) -> Mixer:
     """The network that is the projection on the bases; its bent part is there but says nothing yet."""
-    n_drivers = len(avatar.blendshape_names) - len(scale)
+    jaw = scale.new_ones(0 if avatar.drivers is None else N_DRIVERS_SEEN)
     generator = torch.Generator().manual_seed(seed)
-    n_inputs = len(scale) + n_drivers
+    n_inputs = len(scale) + len(jaw)
     return Mixer(
-        scale=torch.cat([scale, scale.new_ones(n_drivers)]),
+        scale=torch.cat([scale, jaw]),
         linear=turn,
         hidden=torch.randn(HIDDEN, n_inputs, generator=generator) / n_inputs**0.5,
         bias=2 * torch.rand(HIDDEN, generator=generator) - 1,

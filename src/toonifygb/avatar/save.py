@@ -21,7 +21,7 @@ from safetensors.torch import load_file, save_file
 
 from toonifygb.atomic import replacing
 from toonifygb.avatar import packing
-from toonifygb.avatar.bases import Mixer
+from toonifygb.avatar.bases import N_DRIVERS_SEEN, Mixer
 from toonifygb.avatar.fields import cut_deltas, extended, last_changed
 from toonifygb.avatar.model import Avatar, PoseDrivers
 from toonifygb.errors import InputError
@@ -226,10 +226,11 @@ def _check_sizes(avatar: Avatar, facts: dict[str, Any], path: Path) -> None:
     }
     if avatar.mixer is not None:
         mixer, n_hidden = avatar.mixer, len(avatar.mixer.bias)
+        n_inputs = n_psi - n_drivers + min(n_drivers, N_DRIVERS_SEEN)
         expected |= {
-            "mixer.scale": (mixer.scale, (n_psi,)),
+            "mixer.scale": (mixer.scale, (n_inputs,)),
             "mixer.linear": (mixer.linear, (mixer.n_bases, n_psi - n_drivers)),
-            "mixer.hidden": (mixer.hidden, (n_hidden, n_psi)),
+            "mixer.hidden": (mixer.hidden, (n_hidden, n_inputs)),
             "mixer.out": (mixer.out, (mixer.n_bases, n_hidden)),
         }
     for name, (tensor, shape) in expected.items():

@@ -186,7 +186,7 @@ class Optimizer:
 
 def mixer_gradient(mixer: Mixer, psi: Float[Tensor, " k"], by_weight: Float[Tensor, " b"]) -> dict[str, Tensor]:
     """Derivatives by what is learned of the network, from that by its weights w."""
-    x = psi / mixer.scale
+    x = psi[: len(mixer.scale)] / mixer.scale
     bent, rest = (mixer.hidden @ x + mixer.bias).tanh(), mixer.bias.tanh()
     by_bent = by_weight @ mixer.out
     by_hidden = by_bent * (1 - bent.square())
