@@ -19,6 +19,7 @@ from toonifygb.errors import InputError
 Quality = Literal["draft", "standard", "paper"]
 TrackOn = Literal["auto", "original", "stylized"]
 Storage = Literal["compact", "full"]
+Blendshapes = Literal["full", "reduced"]
 Framing = Literal["auto", "full", "crop", "published", "aligned"]
 
 
@@ -112,8 +113,11 @@ class TrainConfig:
     """Optimiser steps, one frame each."""
     sh_degree: int = 1
     """Degree of the view-dependent colour, reached step by step."""
+    blendshapes: Blendshapes = "full"
+    """full: Gaussians have a change of their own for every blendshape of the head model; reduced: a few learned
+    bases for all of them, weighed by a small network."""
     n_bases: int | None = None
-    """Expression blendshapes kept; all of the head model when unset."""
+    """Learned bases of reduced blendshapes, 20 when unset; expression units kept of full ones, all when unset."""
     crop_scale: float = 2.2
     """Side of the head crop in units of the face box."""
     l1_weight: float = 0.8

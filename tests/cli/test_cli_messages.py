@@ -40,6 +40,21 @@ def no_such_file(folder: Path) -> list[str]:
     return ["create", str(folder / "absent.mp4"), "--out", str(folder / "run")]
 
 
+def no_bases(folder: Path) -> list[str]:
+    clip = write_clip(folder / "clip.mp4", 2)
+    return ["create", str(clip), "--out", str(folder / "run"), "--blendshapes", "reduced", "--n-bases", "0"]
+
+
+def too_many_bases(folder: Path) -> list[str]:
+    clip = write_clip(folder / "clip.mp4", 2)
+    return ["create", str(clip), "--out", str(folder / "run"), "--blendshapes", "reduced", "--n-bases", "60"]
+
+
+def unknown_blendshapes(folder: Path) -> list[str]:
+    clip = write_clip(folder / "clip.mp4", 2)
+    return ["create", str(clip), "--out", str(folder / "run"), "--settings", "train.blendshapes=few"]
+
+
 def not_a_video(folder: Path) -> list[str]:
     path = folder / "notes.mp4"
     path.write_text("milk, bread, apples")
@@ -129,6 +144,9 @@ CASES: dict[str, Callable[[Path], list[str]]] = {
         unknown_style,
         no_face,
         unknown_setting,
+        no_bases,
+        too_many_bases,
+        unknown_blendshapes,
         unknown_command,
         output_is_a_file,
         output_holds_other_things,

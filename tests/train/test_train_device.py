@@ -22,6 +22,7 @@ from toonifygb.render.fused import ReferenceKernels
 from toonifygb.structures import Camera, Splats, TrackedSequence
 from toonifygb.train import Dataset, build_dataset, evaluate, train
 from toonifygb.train.densify import Densifier, DensifyRules
+from toonifygb.train.optim import LEARNED
 from toonifygb.train.photometric import _above_chin, carried
 from toonifygb.train.state import TrainState
 from toonifygb.train.step import Stepper
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from torch import Tensor
+
+    from toonifygb.config import Blendshapes
 
 
 class TorchCompositing(cuda.CudaRenderer):
@@ -108,14 +111,15 @@ def test_images_come_back_to_the_splats(home: torch.device | str) -> None:
         torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("blendshapes", ["full", "reduced"])
 @pytest.mark.usefixtures("gpu")
 def test_training_is_the_same_there(
-    clip: tuple[Dataset, TrackedSequence], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    clip: tuple[Dataset, TrackedSequence], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, blendshapes: Blendshapes
 ) -> None:
     dataset, sequence = clip
     monkeypatch.setattr("toonifygb.train.loop.Densifier", _eager_densifier)
     config = replace(TINY, n_gaussians=60, n_mouth_gaussians=12, resolution=32, steps=5, densify=True)
-    config = replace(config, checkpoint_seconds=0.0)  # one after every step
+    config = replace(config, checkpoint_seconds=0.0, blendshapes=blendshapes)  # a checkpoint after every step
     trained = []
     for name in ("reference", "cuda"):
         trained.append(train(dataset, sequence, tiny_head(), config, tmp_path / name, backend=name))
@@ -126,6 +130,10 @@ def test_training_is_the_same_there(
             found, expected = (getattr(getattr(avatar, part), field) for avatar in (moved, plain))
             assert not isinstance(found, OnDevice) and found.shape == expected.shape
             torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
+    for field in LEARNED if blendshapes == "reduced" else ():
+        found, expected = (getattr(avatar.mixer, field) for avatar in (moved, plain))
+        assert not isinstance(found, OnDevice)
+        torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
 
 
 def _eager_densifier(*arguments) -> Densifier:

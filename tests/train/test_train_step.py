@@ -13,6 +13,7 @@ from make import TINY, tiny_avatar, tiny_head, tiny_sequence
 
 from toonifygb import render
 from toonifygb.avatar import Avatar, MouthVolume
+from toonifygb.avatar.bases import Mixer
 from toonifygb.avatar.fields import FIELDS, join
 from toonifygb.avatar.skinning import activate, scale_deltas
 from toonifygb.errors import InputError
@@ -22,12 +23,17 @@ from toonifygb.train import Dataset, build_dataset, evaluate, first_avatar, trai
 from toonifygb.train.densify import DensifyRules
 from toonifygb.train.losses import LossWeights, image_loss, mouth_loss, placed_on
 from toonifygb.train.optim import (
+    BASIS_EPS,
     DELTA_EPS,
     DELTA_RATES,
     DRIVER_TRAVEL,
     FULL_STEPS,
+    LEARNED,
+    MIXER_EPS,
+    MIXER_RATE,
     NEUTRAL_RATES,
     means_decay,
+    mixer_gradient,
     settling,
 )
 from toonifygb.train.state import TrainState, read_checkpoint, write_checkpoint
@@ -35,6 +41,10 @@ from toonifygb.train.step import Stepper
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from toonifygb.config import TrainConfig
+
+REDUCED = replace(TINY, blendshapes="reduced", n_bases=4)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +67,10 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, TrackedSequ
 
 def same(a: Avatar, b: Avatar) -> bool:
     names = ("neutral", "deltas", "mouth_upper", "mouth_lower")
-    return all(torch.equal(getattr(getattr(a, n), f), getattr(getattr(b, n), f)) for n in names for f in FIELDS)
+    records = [(getattr(a, n), getattr(b, n), FIELDS) for n in names]
+    assert (a.mixer is None) == (b.mixer is None)
+    records += [] if a.mixer is None else [(a.mixer, b.mixer, LEARNED)]
+    return all(torch.equal(getattr(left, f), getattr(right, f)) for left, right, parts in records for f in parts)
 
 
 class PlainTraining:
@@ -66,21 +79,27 @@ class PlainTraining:
     def __init__(self, template: Avatar) -> None:
         self.state = TrainState.start(template, TINY.seed)
         self.template = template
-        self.n_expression = n_expression = template.n_expressions + template.n_eyelids
-        self.scale = torch.ones(len(template.blendshape_names), self.state.counts.face)
-        self.scale[:n_expression] = 0.0
-        self.scale[:n_expression, : self.state.counts.moved] = self.state.scale
+        self.scale = torch.ones(len(template.deltas.means), self.state.counts.face)
+        self.scale[: template.n_bases] = 0.0
+        self.scale[: template.n_bases, : self.state.counts.moved] = self.state.scale
         sets = [template.neutral, template.mouth_upper, template.mouth_lower]
         self.sets = [part.map(lambda t: t.clone().requires_grad_()) for part in sets]
-        self.trained = template.deltas.map(lambda t: torch.zeros_like(t).requires_grad_())
-        self.groups, self.driver_share = [], {}
+        self.parts = [slice(0, template.n_bases), slice(template.n_bases, None)]
+        self.trained = [
+            template.deltas.map(lambda t, rows=rows: torch.zeros_like(t[rows]).requires_grad_())
+            for rows in self.parts
+        ]
+        self.groups = []
         for name in FIELDS:
             key = "sh_dc" if name == "sh" else name
             faster = FULL_STEPS / TINY.steps if name in {"means", "opacity_logits"} else 1
             self.add([getattr(part, name) for part in self.sets], NEUTRAL_RATES[key], name != "means", 1e-15)
-            rate = DELTA_RATES[key] * faster
-            self.add([getattr(self.trained, name)], rate, True, DELTA_EPS)
-            self.driver_share[name] = DRIVER_TRAVEL[key] / TINY.steps / rate
+            own, driver = (getattr(part, name) for part in self.trained)
+            self.add([own], DELTA_RATES[key] * faster, True, DELTA_EPS if template.mixer is None else BASIS_EPS)
+            self.add([driver], DRIVER_TRAVEL[key] / TINY.steps, True, DELTA_EPS)
+        self.mixer = None if template.mixer is None else template.mixer.map(lambda t: t.clone().requires_grad_())
+        if self.mixer is not None:
+            self.add([getattr(self.mixer, name) for name in LEARNED], MIXER_RATE, True, MIXER_EPS)
         self.adam = torch.optim.Adam([dict(group) for group in self.groups])
         self.volume = MouthVolume.around(join([template.mouth_upper, template.mouth_lower]).means)
 
@@ -88,28 +107,27 @@ class PlainTraining:
         self.groups.append({"params": tensors, "lr": rate, "settles": settles, "eps": eps})
 
     def deltas(self) -> GaussianParams:
-        fixed = self.template.deltas
-        return GaussianParams(**{name: getattr(fixed, name) + getattr(self.trained, name) for name in FIELDS})
+        fixed, trained = self.template.deltas, join(self.trained)
+        return GaussianParams(**{name: getattr(fixed, name) + getattr(trained, name) for name in FIELDS})
 
     def damped_step(self) -> None:
         """Adam's step, of which the deltas take the share that blendshape consistency allows."""
-        before = self.trained.map(lambda t: t.detach().clone())
+        before = [part.map(lambda t: t.detach().clone()) for part in self.trained]
         self.adam.step()
         with torch.no_grad():
-            change = GaussianParams(
-                **{name: getattr(self.trained, name) - getattr(before, name) for name in FIELDS}
-            )
-            damped = scale_deltas(change, self.scale)
-            for name in FIELDS:
-                getattr(damped, name)[self.n_expression :] *= self.driver_share[name]
-                getattr(self.trained, name).copy_(getattr(before, name) + getattr(damped, name))
+            for part, old, rows in zip(self.trained, before, self.parts, strict=True):
+                change = GaussianParams(**{name: getattr(part, name) - getattr(old, name) for name in FIELDS})
+                damped = scale_deltas(change, self.scale[rows])
+                for name in FIELDS:
+                    getattr(part, name).copy_(getattr(old, name) + getattr(damped, name))
 
     def step(self, dataset: Dataset, sequence: TrackedSequence) -> None:
         index = self.state.next_frame(dataset.split.train)
         background = self.state.next_background()
         self.state.step += 1
         neutral, upper, lower = self.sets
-        avatar = replace(self.template, neutral=neutral, mouth_upper=upper, mouth_lower=lower, deltas=self.deltas())
+        sets = {"neutral": neutral, "mouth_upper": upper, "mouth_lower": lower, "deltas": self.deltas()}
+        avatar = replace(self.template, **sets, mixer=self.mixer)
         image = render.get("auto", 1).render(
             avatar.pose(sequence.motion[index]), dataset.camera(index), background=background, sh_degree=0
         )
@@ -131,10 +149,11 @@ class DegreeZero(Stepper):
     sh_degree = 0  # type: ignore[assignment]
 
 
-def test_fast_step_equals_the_plain_one(clip: tuple[Dataset, TrackedSequence]) -> None:
+@pytest.mark.parametrize("config", [TINY, REDUCED], ids=["full", "reduced"])
+def test_fast_step_equals_the_plain_one(clip: tuple[Dataset, TrackedSequence], config: TrainConfig) -> None:
     """Two steps, every parameter."""
     dataset, sequence = clip
-    template = first_avatar(dataset, sequence, tiny_head(), TINY)
+    template = first_avatar(dataset, sequence, tiny_head(), config)
     # Round Gaussians have no gradient for their rotation, and unturned ones none for w, but rounding noise, of
     # which Adam keeps the sign.
     stretched = template.neutral.log_scales + torch.tensor([0.4, 0.0, -0.4])
@@ -146,7 +165,7 @@ def test_fast_step_equals_the_plain_one(clip: tuple[Dataset, TrackedSequence]) -
     for _ in range(2):
         stepper.step()
         plain.step(dataset, sequence)
-    n_face, n_expression = state.counts.face, template.n_expressions + template.n_eyelids
+    n_face, n_expression = state.counts.face, template.n_bases
     wanted, applied = join(plain.sets), plain.deltas()
     groups = {
         "neutral": (state.neutral.values, wanted, first, n_face),
@@ -171,17 +190,48 @@ def test_fast_step_equals_the_plain_one(clip: tuple[Dataset, TrackedSequence]) -
             wrong = ((moved - expected).abs() > 0.02 * expected.abs().max()).float().mean()
             assert wrong < 0.02, (group, name, float(wrong))
             assert (expected != 0).any(), (group, name)
+    if state.mixer is None or plain.mixer is None:
+        assert config is TINY
+        return
+    for name in LEARNED:
+        mixers = (template.mixer, state.mixer.values, plain.mixer)
+        origin, ours, theirs = (getattr(mixer, name).detach() for mixer in mixers)
+        # Adam's first steps are ± the rate: where a gradient is nearly 0, float32 may choose the other sign.
+        wrong = ((ours - theirs).abs() > 0.05 * MIXER_RATE).float().mean()
+        assert wrong < 0.05, (name, float(wrong))
+        assert not torch.equal(origin, ours), name
 
 
-@pytest.mark.parametrize("grow", [False, True])
+def test_slope_of_the_network_equals_autograd() -> None:
+    """Random weights, coefficients and slopes, in double precision."""
+    generator = torch.Generator().manual_seed(2)
+    sizes = {"scale": (6,), "linear": (4, 5), "hidden": (8, 6), "bias": (8,), "out": (4, 8)}
+    values = {
+        name: torch.rand(size, generator=generator, dtype=torch.float64) + 0.1 for name, size in sizes.items()
+    }
+    psi, by_weight = torch.randn(2, 9, generator=generator, dtype=torch.float64)
+    by_weight = by_weight[:4]
+    mixer = Mixer(**{name: value.requires_grad_(name in LEARNED) for name, value in values.items()})
+    wanted = torch.autograd.grad(mixer(psi), [getattr(mixer, name) for name in LEARNED], by_weight)
+    found = mixer_gradient(mixer.detach(), psi, by_weight)
+    assert tuple(found) == LEARNED
+    for (name, slope), expected in zip(found.items(), wanted, strict=True):
+        assert torch.allclose(slope, expected), name
+
+
+@pytest.mark.parametrize(("grow", "base"), [(False, TINY), (True, TINY), (True, REDUCED)])
 def test_resumed_training_equals_a_straight_one(
-    clip: tuple[Dataset, TrackedSequence], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grow: bool
+    clip: tuple[Dataset, TrackedSequence],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    grow: bool,
+    base: TrainConfig,
 ) -> None:
     dataset, sequence = clip
     # A new generation every three steps, one of them between the checkpoint and its resumption.
     eager = DensifyRules(first=0.1, last=0.9, every=3, face_threshold=1e-5, mouth_threshold=1e-5)
     monkeypatch.setattr("toonifygb.train.densify.DensifyRules", lambda: eager)
-    config = replace(TINY, steps=20, densify=grow)
+    config = replace(base, steps=20, densify=grow)
 
     class StopAt:
         def __init__(self, step: int) -> None:
@@ -244,11 +294,12 @@ def test_every_epoch_takes_each_frame_once(clip: tuple[Dataset, TrackedSequence]
     assert epochs[0] != epochs[1]
 
 
-def test_training_learns(clip: tuple[Dataset, TrackedSequence], tmp_path: Path) -> None:
+@pytest.mark.parametrize("config", [TINY, REDUCED], ids=["full", "reduced"])
+def test_training_learns(clip: tuple[Dataset, TrackedSequence], tmp_path: Path, config: TrainConfig) -> None:
     """The loss falls and the score on frames never trained on rises by several decibels."""
     dataset, sequence = clip
-    before = first_avatar(dataset, sequence, tiny_head(), TINY)
-    after = train(dataset, sequence, tiny_head(), replace(TINY, steps=250), tmp_path)
+    before = first_avatar(dataset, sequence, tiny_head(), config)
+    after = train(dataset, sequence, tiny_head(), replace(config, steps=250), tmp_path)
     scores = [evaluate(a, dataset, sequence, dataset.split.test) for a in (before, after)]
     assert scores[1]["psnr"] > scores[0]["psnr"] + 4
     assert scores[1]["ssim"] > scores[0]["ssim"] + 0.05

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import torch
 
+from toonifygb.avatar.bases import check_bases, reduced
 from toonifygb.avatar.model import POSE_DRIVERS, Avatar, PoseDrivers, pose_quantities
 from toonifygb.avatar.mouth import mouth_points
 from toonifygb.avatar.transfer import consistency, turns
@@ -83,9 +84,14 @@ def init_avatar(
         camera: camera of the training crops.
         full_camera: camera of the whole clip; the training camera when ``None``.
         views: training images for hair and colours; without them the head is bald and grey.
+
+    Raises:
+        InputError: a number of bases that the head model has no use for.
     """
+    check_bases(config, head)
     rest = head.rest(shape)
-    n_expressions = min(config.n_bases or head.n_blendshapes or head.n_expression, head.n_expression)
+    n_kept = config.n_bases if config.blendshapes == "full" else None
+    n_expressions = n_kept or head.n_blendshapes or head.n_expression
     face = _face_set(head, rest, n_expressions, config, views)
     names = list(head.expression_names[:n_expressions])
     n_eyelids = 0 if head.eyelid_basis is None else 2
@@ -95,7 +101,7 @@ def init_avatar(
     camera = camera or tracked_camera(*_FALLBACK_CAMERA)
     upper, lower = _mouth_sets(head, rest, config, views)
     lowest, highest, mean = _ranges(head, motion)
-    return Avatar(
+    avatar = Avatar(
         neutral=face.neutral,
         deltas=_extended(face.deltas, len(names)),
         blendshape_names=tuple(names),
@@ -121,6 +127,7 @@ def init_avatar(
         shape=shape,
         meta={"n_moved": face.n_moved},
     )
+    return avatar if config.blendshapes == "full" else reduced(avatar, head, config, motion)
 
 
 def pose_drivers(motion: HeadMotion) -> PoseDrivers:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from toonifygb.avatar.bases import Mixer
 from toonifygb.avatar.skinning import activate, blend_parameters, concatenate, pose_offsets, skin_splats
 from toonifygb.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from toonifygb.geometry.skinning import blend_transforms, joint_transforms, pose_feature
@@ -56,7 +57,7 @@ class Avatar(TensorRecord):
     neutral: GaussianParams
     """B0, face set, rest pose, m."""
     deltas: GaussianParams
-    """ΔBk; leading axis = ``blendshape_names``."""
+    """ΔBk; leading axis = ``blendshape_names``, or the bases of ``mixer``, then the pose drivers."""
     blendshape_names: tuple[str, ...]
     """Expression units of the head model, then eyelids (where it has them), then ``POSE_DRIVERS``."""
     n_expressions: int
@@ -95,6 +96,8 @@ class Avatar(TensorRecord):
     head_model: str
     shape: Float[Tensor, " s"]
     """β, identity coefficients of the head model."""
+    mixer: Mixer | None = None
+    """Weights of few bases from all blendshapes' coefficients; ``None`` where every blendshape has its ΔBk."""
     meta: dict[str, Any] = field(default_factory=dict)
     """JSON-able facts: versions, configuration, scores."""
 
@@ -108,8 +111,20 @@ class Avatar(TensorRecord):
         """Degree of the view-dependent colour."""
         return round(self.neutral.sh.shape[-2] ** 0.5) - 1
 
-    def coefficients(self, motion: HeadMotion) -> Float[Tensor, "*b k"]:
-        """ψ, one coefficient per blendshape: expression, eyelids, pose drivers."""
+    @property
+    def n_bases(self) -> int:
+        """Rows of ``deltas`` before those of the pose drivers."""
+        return self.n_expressions + self.n_eyelids if self.mixer is None else self.mixer.n_bases
+
+    def coefficients(self, motion: HeadMotion) -> Float[Tensor, "*b r"]:
+        """What the rows of ``deltas`` are multiplied with: ψ, or the bases' weights and the pose drivers' ψ."""
+        psi = self.signals(motion)
+        if self.mixer is None:
+            return psi
+        return torch.cat([self.mixer(psi), psi[..., self.n_expressions + self.n_eyelids :]], dim=-1)
+
+    def signals(self, motion: HeadMotion) -> Float[Tensor, "*b k"]:
+        """ψ, one coefficient per name in ``blendshape_names``: expression, eyelids, pose drivers."""
         parts = [motion.expression[..., : self.n_expressions], motion.eyelids[..., : self.n_eyelids]]
         if self.drivers is not None:
             parts.append(self.drivers.coefficients(motion))

@@ -41,10 +41,10 @@ class Poser:
         weights.append(avatar.mouth_upper_weights.expand(avatar.mouth_upper.n, -1))
         weights.append(avatar.mouth_lower_weights.expand(avatar.mouth_lower.n, -1))
         self._weights = torch.cat(weights).to(device)
-        self._n_expression = avatar.n_expressions + avatar.n_eyelids
+        self._n_bases = avatar.n_bases
         dtype = torch.bfloat16 if half else torch.float32
-        expression = cut(avatar.deltas, 0, self._n_expression)
-        driver = avatar.deltas.map(lambda delta: delta[self._n_expression :])
+        expression = cut(avatar.deltas, 0, self._n_bases)
+        driver = avatar.deltas.map(lambda delta: delta[self._n_bases :])
         groups = [cut_deltas(group, 0, last_changed(group)) for group in (expression, driver)]
         self._groups = [group.map(lambda delta: delta.to(device, dtype).contiguous()) for group in groups]
 
@@ -55,7 +55,7 @@ class Poser:
             # A few dozen numbers: the processor has them before a device would have started.
             psi = avatar.coefficients(motion).to(device)
             feature, transforms = avatar.pose_feature(motion).to(device), avatar.transforms(motion).to(device)
-            raw = self._blend([psi[: self._n_expression].contiguous(), psi[self._n_expression :].contiguous()])
+            raw = self._blend([psi[: self._n_bases].contiguous(), psi[self._n_bases :].contiguous()])
             face = raw.means[: avatar.neutral.n]
             face += pose_offsets(feature, self._pose_basis)
             return self._kernels.skin(raw, self._weights, transforms)

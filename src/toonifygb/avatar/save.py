@@ -21,6 +21,7 @@ from safetensors.torch import load_file, save_file
 
 from toonifygb.atomic import replacing
 from toonifygb.avatar import packing
+from toonifygb.avatar.bases import N_DRIVERS_SEEN, Mixer
 from toonifygb.avatar.fields import cut_deltas, extended, last_changed
 from toonifygb.avatar.model import Avatar, PoseDrivers
 from toonifygb.errors import InputError
@@ -39,6 +40,7 @@ _RECORDS: dict[str, type[TensorRecord]] = {
     "neutral": GaussianParams,
     "deltas": GaussianParams,
     "drivers": PoseDrivers,
+    "mixer": Mixer,
     "mouth_upper": GaussianParams,
     "mouth_lower": GaussianParams,
     "motion_lower": HeadMotion,
@@ -137,6 +139,7 @@ def _facts(avatar: Avatar) -> dict[str, Any]:
         "n_expressions": avatar.n_expressions,
         "n_eyelids": avatar.n_eyelids,
         "has_drivers": avatar.drivers is not None,
+        "has_mixer": avatar.mixer is not None,
         "pose_features": list(avatar.pose_features),
         "parents": list(avatar.parents),
         "camera_size": [avatar.camera.width, avatar.camera.height],
@@ -169,6 +172,7 @@ def _assemble(tensors: dict[str, Tensor], facts: dict[str, Any], path: Path) -> 
     packed = facts["storage"] == "compact"
     left_out = {"deltas"} if packed else set()
     left_out |= set() if facts["has_drivers"] else {"drivers"}
+    left_out |= set() if facts.get("has_mixer") else {"mixer"}  # avatars from before there were any do not say
     records = {name: kind for name, kind in _RECORDS.items() if name not in left_out}
     wanted = {*_PLAIN, *_PLAIN_MOUTH, *(_PACKED + name for name in packing.names() if packed)}
     for name, kind in records.items():
@@ -182,12 +186,12 @@ def _assemble(tensors: dict[str, Tensor], facts: dict[str, Any], path: Path) -> 
     }
     deltas = _unpacked(tensors, facts["n_gaussians"], path) if packed else None
     tensors = {name: tensor.float() if tensor.is_floating_point() else tensor for name, tensor in tensors.items()}
-    built: dict[str, Any] = {name: tensors[name] for name in (*_PLAIN, *_PLAIN_MOUTH)}
+    built: dict[str, Any] = {"drivers": None, "mixer": None}
+    built |= {name: tensors[name] for name in (*_PLAIN, *_PLAIN_MOUTH)}
     for name, kind in records.items():
         parts = {p.name: tensors[f"{name}.{p.name}"] for p in fields(kind) if f"{name}.{p.name}" in tensors}
         built[name] = kind(**parts, **extra.get(name, {}))
     built["deltas"] = deltas or extended(built["deltas"], facts["n_gaussians"])
-    built.setdefault("drivers", None)
     avatar = Avatar(
         **built,
         blendshape_names=tuple(facts["blendshape_names"]),
@@ -212,12 +216,23 @@ def _unpacked(tensors: dict[str, Tensor], n: int, path: Path) -> GaussianParams:
 
 def _check_sizes(avatar: Avatar, facts: dict[str, Any], path: Path) -> None:
     n, k = facts["n_gaussians"], (facts["sh_degree"] + 1) ** 2
+    n_psi = len(avatar.blendshape_names)
+    n_drivers = n_psi - avatar.n_expressions - avatar.n_eyelids
     expected = {
         "neutral.sh": (avatar.neutral.sh, (n, k, 3)),
-        "deltas.sh": (avatar.deltas.sh, (len(avatar.blendshape_names), n, k, 3)),
+        "deltas.sh": (avatar.deltas.sh, (avatar.n_bases + n_drivers, n, k, 3)),
         "skin_weights": (avatar.skin_weights, (n, len(avatar.parents))),
         "pose_basis": (avatar.pose_basis, (len(avatar.pose_features), n, 3)),
     }
+    if avatar.mixer is not None:
+        mixer, n_hidden = avatar.mixer, len(avatar.mixer.bias)
+        n_inputs = n_psi - n_drivers + min(n_drivers, N_DRIVERS_SEEN)
+        expected |= {
+            "mixer.scale": (mixer.scale, (n_inputs,)),
+            "mixer.linear": (mixer.linear, (mixer.n_bases, n_psi - n_drivers)),
+            "mixer.hidden": (mixer.hidden, (n_hidden, n_inputs)),
+            "mixer.out": (mixer.out, (mixer.n_bases, n_hidden)),
+        }
     for name, (tensor, shape) in expected.items():
         if tuple(tensor.shape) != shape:
             raise InputError(

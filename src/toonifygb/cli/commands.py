@@ -12,6 +12,7 @@ from toonifygb.cli.style import style
 from toonifygb.config import (
     PRESETS,
     WHOLE_PICTURE,
+    Blendshapes,
     FaceConfig,
     Quality,
     RunConfig,
@@ -36,6 +37,8 @@ def create(
     track_on: TrackOn = "auto",
     head: str = "open",
     choose_face: str = "largest",
+    blendshapes: Blendshapes = "full",
+    n_bases: int | None = None,
     max_frames: int | None = None,
     backend: str = "auto",
     threads: int | None = None,
@@ -53,6 +56,8 @@ def create(
         track_on: Video whose landmarks the head model is fitted to.
         head: Head model: open, or flame or flame2023 once you have added it (toonifygb assets add flame).
         choose_face: Which face to follow: largest, left, right, centre, or a number counted from the left.
+        blendshapes: full, or reduced: a few learned bases for all expressions, for smaller and faster avatars.
+        n_bases: Learned bases of reduced blendshapes, 20 when unset; of full ones, expression units kept.
         max_frames: Use only the first frames.
         backend: Rasteriser: auto, cuda, gsplat, native or reference.
         threads: Threads of the native engine; all cores when unset.
@@ -65,7 +70,7 @@ def create(
         stylize=StylizeConfig(style=style, strength=strength),
         face=FaceConfig(choose=choose_face),
         track=TrackConfig(on=track_on),
-        train=PRESETS[quality],
+        train=dataclasses.replace(PRESETS[quality], blendshapes=blendshapes, n_bases=n_bases),
         max_frames=max_frames,
         backend=backend,
         threads=threads,
@@ -170,6 +175,8 @@ def train(
     /,
     quality: Quality | None = None,
     head: str | None = None,
+    blendshapes: Blendshapes | None = None,
+    n_bases: int | None = None,
     settings: tuple[str, ...] = (),
     quiet: bool = False,
 ) -> None:
@@ -179,6 +186,8 @@ def train(
         run: Folder that ``create`` or ``import`` made.
         quality: Another quality; the run's own when unset.
         head: Another head model, with which the clip is tracked again; the run's own when unset.
+        blendshapes: full, or reduced: a few learned bases for all expressions; the run's own when unset.
+        n_bases: Their number; of full ones, expression units kept.
         settings: Any setting by name, for instance train.steps=20000.
         quiet: Say nothing but errors.
     """
@@ -191,6 +200,12 @@ def train(
         run_config = dataclasses.replace(run_config, quality=quality, train=preset)
     if head:
         run_config = dataclasses.replace(run_config, head=head)
+    training = run_config.train
+    if blendshapes:
+        training = dataclasses.replace(training, blendshapes=blendshapes, n_bases=None)
+    if n_bases is not None:
+        training = dataclasses.replace(training, n_bases=n_bases)
+    run_config = dataclasses.replace(run_config, train=training)
     _create(clip, run, _with(run_config, settings), quiet)
 
 

@@ -23,7 +23,7 @@ from toonifygb.pipeline import imported
 from toonifygb.pipeline.files import LANDMARK_TRACK, load_landmarks, open_crops, save_landmarks
 from toonifygb.pipeline.outcome import outcome
 from toonifygb.pipeline.segments import SEGMENT, Segments
-from toonifygb.pipeline.source import Source, open_style, style_inputs
+from toonifygb.pipeline.source import Source, head_name, open_style, style_inputs
 from toonifygb.pipeline.stages import STATE_FILE
 from toonifygb.structures import Landmarks, TrackedSequence
 
@@ -46,6 +46,7 @@ def create(source: Source, run: Run, config: RunConfig) -> None:
         Stopped: the user asked to stop; calling again goes on.
     """
     check_size(config)
+    check_bases(source, config)
     imported.check_style(source, config)
     remember_request(source, run, config)
     fitted, styled = track_stages(source, run, config)
@@ -68,6 +69,16 @@ def check_size(config: RunConfig) -> None:
             f"setting styleganex.size is '{config.styleganex.size}'; an avatar needs frames of the clip's own size",
             "leave it at source, or write the larger video alone with: toonifygb stylize",
         )
+
+
+def check_bases(source: Source, config: RunConfig) -> None:
+    """Refuses a number of blendshape bases before any work is done.
+
+    Raises:
+        InputError: one that the head model has no use for.
+    """
+    if config.train.n_bases is not None:
+        avatars.check_bases(config.train, head.load(head_name(config, source.foreign)))
 
 
 def import_only(source: Source, run: Run, config: RunConfig) -> None:

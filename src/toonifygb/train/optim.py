@@ -7,8 +7,11 @@ fewer steps: what would hardly move in so few (delta positions and opacities) ta
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import torch
+
+from toonifygb.avatar.bases import Mixer
 from toonifygb.avatar.fields import FIELDS, each, rows, width
 from toonifygb.structures import GaussianParams
 
@@ -55,9 +58,16 @@ DELTA_EPS = 1e-6
 """Adam's ε for the deltas. With 3DGB's 1e-15 a Gaussian that is hidden in nearly every frame moves at the full
 rate on gradients that are mere noise, and shows it in poses that training never saw; so it stays with the mesh.
 Held-out score of a clip whose end turns away from the rest: +0.9 dB."""
+BASIS_EPS = 5 * DELTA_EPS
+"""The same for the bases of reduced blendshapes, whose weights are about 1 where coefficients are about 0.2."""
 MEANS_DECAY = 0.01
 """Final over first rate of the neutral positions; log-linear over the first ``DECAY_SHARE`` of the steps."""
 DECAY_SHARE = 0.75
+LEARNED = ("hidden", "bias", "out")
+"""Fields of a mixer that are trained. The linear part stays what the head model says: trained with the rest it
+scores the same on a clip, but eyes that were seldom closed there no longer close when they are told to."""
+MIXER_RATE, MIXER_EPS = 1e-3, 1e-8
+"""Adam's rate and ε for them."""
 SETTLE_FROM, SETTLE_TO = 0.6, 0.1
 """From this share of the steps on all rates fall, log-linear, to this share of themselves: it quiets the noise of
 single-image steps."""
@@ -69,6 +79,8 @@ class Coefficients:
 
     expression: Float[Tensor, " e"]
     driver: Float[Tensor, " d"]
+    psi: Float[Tensor, " k"]
+    """All of the frame, from which a mixer makes ``expression``."""
 
 
 def blend(state: TrainState, psi: Coefficients, kernels: Kernels) -> GaussianParams:
@@ -103,6 +115,10 @@ class Optimizer:
         self._expression = _rates(state.expression.values, delta)
         driver = {name: travel / steps for name, travel in DRIVER_TRAVEL.items()}
         self._driver = _rates(state.driver.values, driver)
+        self._mixer = {}
+        if state.mixer is not None:
+            learned = {name: getattr(state.mixer.values, name).view(-1) for name in LEARNED}
+            self._mixer = {name: torch.full_like(values, MIXER_RATE) for name, values in learned.items()}
 
     def step(self, state: TrainState, gradient: GaussianParams, psi: Coefficients) -> None:
         """One Adam step.
@@ -114,6 +130,9 @@ class Optimizer:
         """
         settle = settling(state.step / self._steps)
         means = means_decay(state.step / self._steps)
+        own_eps = DELTA_EPS if state.mixer is None else BASIS_EPS
+        if state.mixer is not None:
+            self._mixer_step(state, gradient, psi, settle)
         for name, g in each(gradient):
             factor = means if name == "means" else settle
             values, first, second = _parts(state.neutral, name)
@@ -127,9 +146,9 @@ class Optimizer:
                 state.step,
                 factor=factor,
             )
-            for trained, rates, coefficients, scale in (
-                (state.expression, self._expression, psi.expression, state.scale),
-                (state.driver, self._driver, psi.driver, None),
+            for trained, rates, coefficients, scale, eps in (
+                (state.expression, self._expression, psi.expression, state.scale, own_eps),
+                (state.driver, self._driver, psi.driver, None, DELTA_EPS),
             ):
                 values, first, second = _parts(trained, name)
                 if not len(values):
@@ -144,11 +163,38 @@ class Optimizer:
                     rates[name],
                     state.step,
                     factor=settle,
-                    eps=DELTA_EPS,
+                    eps=eps,
                     scale=scale,
                     widths=(width(name, state.neutral.values.sh.shape[1]),),
                     skip_inactive=True,
                 )
+
+    def _mixer_step(self, state: TrainState, gradient: GaussianParams, psi: Coefficients, settle: float) -> None:
+        """Adam on the network that weighs the bases; the derivative by a basis' weight is its product with g."""
+        assert state.mixer is not None
+        by_weight = torch.zeros_like(psi.expression)
+        for name, bases in each(state.expression.values):
+            matrix = rows(bases)
+            by_weight += matrix @ getattr(gradient, name).reshape(-1)[: matrix.shape[1]]
+        for name, found in mixer_gradient(state.mixer.values, psi.psi, by_weight).items():
+            values, first, second = (part.view(-1) for part in _parts(state.mixer, name))
+            rates = self._mixer[name]
+            self._kernels.adam_step(
+                values, first, second, found.view(-1), rates, state.step, factor=settle, eps=MIXER_EPS
+            )
+
+
+def mixer_gradient(mixer: Mixer, psi: Float[Tensor, " k"], by_weight: Float[Tensor, " b"]) -> dict[str, Tensor]:
+    """Derivatives by what is learned of the network, from that by its weights w."""
+    x = psi[: len(mixer.scale)] / mixer.scale
+    bent, rest = (mixer.hidden @ x + mixer.bias).tanh(), mixer.bias.tanh()
+    by_bent = by_weight @ mixer.out
+    by_hidden = by_bent * (1 - bent.square())
+    return {
+        "hidden": torch.outer(by_hidden, x),
+        "bias": by_hidden - by_bent * (1 - rest.square()),
+        "out": torch.outer(by_weight, bent - rest),
+    }
 
 
 def means_decay(share: float) -> float:
@@ -161,7 +207,7 @@ def settling(share: float) -> float:
     return SETTLE_TO ** max(0.0, (share - SETTLE_FROM) / (1 - SETTLE_FROM))
 
 
-def _parts(trained: Trained, name: str) -> tuple[Tensor, Tensor, Tensor]:
+def _parts(trained: Trained[Any], name: str) -> tuple[Tensor, Tensor, Tensor]:
     return getattr(trained.values, name), getattr(trained.first, name), getattr(trained.second, name)
 
 

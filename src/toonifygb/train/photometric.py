@@ -93,7 +93,14 @@ def refine_track(
     """
     small = dataset.reduced(max(f for f in range(1, max(1, dataset.size // SIZE) + 1) if dataset.size % f == 0))
     frames = torch.tensor(sorted(small.split.train + small.split.test))
-    config = TrainConfig(n_gaussians=10_000, n_mouth_gaussians=1_000, resolution=small.size, steps=STEPS, seed=seed)
+    config = TrainConfig(
+        n_gaussians=10_000,
+        n_mouth_gaussians=1_000,
+        resolution=small.size,
+        steps=STEPS,
+        blendshapes="full",  # the units' own deltas are what the slopes of expressions come from
+        seed=seed,
+    )
     renderer = render.get(backend, threads)
     done, total, figures = 0, STEPS + len(PASSES) * len(frames), {}
     with one_torch_thread():

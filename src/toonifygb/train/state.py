@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from toonifygb.atomic import replacing
+from toonifygb.avatar.bases import Mixer
 from toonifygb.avatar.fields import cut, cut_deltas, extended, join
 from toonifygb.avatar.transfer import consistency
 from toonifygb.errors import InputError
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from toonifygb.avatar import Avatar
+
+
+R = TypeVar("R", bound=TensorRecord)
 
 
 @dataclass(frozen=True)
@@ -59,17 +63,17 @@ class Counts:
 
 
 @dataclass(frozen=True)
-class Trained(TensorRecord):
+class Trained(TensorRecord, Generic[R]):
     """Parameters with Adam's moments; the tensors are changed in place."""
 
-    values: GaussianParams
-    first: GaussianParams
+    values: R
+    first: R
     """Running mean of the gradient."""
-    second: GaussianParams
+    second: R
     """Running mean of its square."""
 
     @classmethod
-    def fresh(cls, values: GaussianParams) -> Trained:
+    def fresh(cls, values: R) -> Trained[R]:
         """Parameters before their first step, copied."""
         values = values.map(lambda tensor: tensor.clone(memory_format=torch.contiguous_format))
         return cls(values, values.map(torch.zeros_like), values.map(torch.zeros_like))
@@ -80,11 +84,13 @@ class TrainState:
     """A training in progress."""
 
     counts: Counts
-    neutral: Trained
-    expression: Trained
-    """Deltas of expressions and eyelids for the ``moved`` group."""
-    driver: Trained
+    neutral: Trained[GaussianParams]
+    expression: Trained[GaussianParams]
+    """Deltas of expressions and eyelids, or their bases, for the ``moved`` group."""
+    driver: Trained[GaussianParams]
     """Deltas driven by the pose for both face groups."""
+    mixer: Trained[Mixer] | None
+    """Weights of the bases, of reduced blendshapes."""
     scale: Float[Tensor, "e moved"]
     """Blendshape consistency: how far each expression delta may be trained."""
     skin_weights: Float[Tensor, "n 5"]
@@ -106,8 +112,7 @@ class TrainState:
         """The state before the first step."""
         counts = Counts.of(avatar)
         n_moved = counts.moved
-        n_expression = avatar.n_expressions + avatar.n_eyelids
-        expression = cut_deltas(cut(avatar.deltas, 0, n_expression), 0, n_moved)
+        expression = cut_deltas(cut(avatar.deltas, 0, avatar.n_bases), 0, n_moved)
         mouth = [
             avatar.mouth_upper_weights.expand(counts.upper, -1),
             avatar.mouth_lower_weights.expand(counts.lower, -1),
@@ -116,7 +121,8 @@ class TrainState:
             counts=counts,
             neutral=Trained.fresh(join([avatar.neutral, avatar.mouth_upper, avatar.mouth_lower])),
             expression=Trained.fresh(expression),
-            driver=Trained.fresh(avatar.deltas.map(lambda delta: delta[n_expression:])),
+            driver=Trained.fresh(avatar.deltas.map(lambda delta: delta[avatar.n_bases :])),
+            mixer=None if avatar.mixer is None else Trained.fresh(avatar.mixer),
             # At the start the deltas are the mesh's displacements, which is what consistency is defined by.
             scale=consistency(expression.means),
             skin_weights=torch.cat([avatar.skin_weights, *mouth]),
@@ -132,7 +138,8 @@ class TrainState:
     def to(self, device: torch.device) -> TrainState:
         """The training with its tensors on a device; what chooses frames stays on the processor."""
         names = ("neutral", "expression", "driver", "scale", "skin_weights", "pose_basis", "pull", "views")
-        return replace(self, **{name: getattr(self, name).to(device) for name in names})
+        mixer = None if self.mixer is None else self.mixer.to(device)
+        return replace(self, mixer=mixer, **{name: getattr(self, name).to(device) for name in names})
 
     def next_frame(self, frames: tuple[int, ...]) -> int:
         """The next training frame: every epoch takes each frame once, in a new random order."""
@@ -159,19 +166,26 @@ class TrainState:
             deltas=deltas,
             skin_weights=self.skin_weights[: counts.face].clone(),
             pose_basis=self.pose_basis.clone(),
+            mixer=None if self.mixer is None else self.mixer.values.map(torch.clone),
             meta=template.meta | {"n_moved": counts.moved},
         )
 
 
 _TENSORS = ("scale", "skin_weights", "pose_basis", "pull", "views", "order")
-_TRAINED = ("neutral", "expression", "driver")
+_TRAINED: dict[str, type[TensorRecord]] = {
+    "neutral": GaussianParams,
+    "expression": GaussianParams,
+    "driver": GaussianParams,
+    "mixer": Mixer,
+}
 
 
 def write_checkpoint(state: TrainState, path: Path, facts: dict[str, Any]) -> None:
     """Writes the state atomically: a process killed at any moment leaves the old file or the new one."""
     state = state.to(torch.device("cpu"))
     tensors = {name: getattr(state, name) for name in _TENSORS}
-    tensors |= {name: tensor for group in _TRAINED for name, tensor in _named(group, getattr(state, group))}
+    groups = [group for group in _TRAINED if getattr(state, group) is not None]
+    tensors |= {name: tensor for group in groups for name, tensor in _named(group, getattr(state, group))}
     tensors["generator"] = state.generator.get_state()
     counts = state.counts
     notes = facts | {
@@ -201,9 +215,7 @@ def read_checkpoint(path: Path) -> tuple[TrainState, dict[str, Any]]:
             step=notes["step"],
             position=notes["position"],
             generator=generator,
-            neutral=_trained("neutral", tensors),
-            expression=_trained("expression", tensors),
-            driver=_trained("driver", tensors),
+            **{group: _trained(group, kind, tensors) for group, kind in _TRAINED.items()},
             **{name: tensors[name] for name in _TENSORS},
         )
     except (SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
@@ -211,19 +223,20 @@ def read_checkpoint(path: Path) -> tuple[TrainState, dict[str, Any]]:
     return state, notes
 
 
-def _named(group: str, trained: Trained) -> list[tuple[str, Tensor]]:
+def _named(group: str, trained: Trained[Any]) -> list[tuple[str, Tensor]]:
     return [
         (f"{group}.{part.name}.{field.name}", getattr(getattr(trained, part.name), field.name))
         for part in fields(Trained)
-        for field in fields(GaussianParams)
+        for field in fields(trained.values)
     ]
 
 
-def _trained(group: str, tensors: dict[str, Tensor]) -> Trained:
+def _trained(group: str, kind: type[R], tensors: dict[str, Tensor]) -> Trained[R] | None:
+    """A group of a checkpoint; ``None`` when it holds none of that name."""
+    if not any(name.startswith(f"{group}.") for name in tensors):
+        return None
     parts = {
-        part.name: GaussianParams(
-            **{field.name: tensors[f"{group}.{part.name}.{field.name}"] for field in fields(GaussianParams)}
-        )
+        part.name: kind(**{field.name: tensors[f"{group}.{part.name}.{field.name}"] for field in fields(kind)})
         for part in fields(Trained)
     }
     return Trained(**parts)

@@ -103,10 +103,7 @@ class Stepper:
         template, device = self._template, self._kernels.device
         self._transforms = template.transforms(sequence.motion).to(device)
         self._features = template.pose_feature(sequence.motion).to(device)
-        psi = template.coefficients(sequence.motion).to(device)
-        n_expression = template.n_expressions + template.n_eyelids
-        self._expression = psi[:, :n_expression].contiguous()
-        self._driver = psi[:, n_expression:].contiguous()
+        self._psi = template.signals(sequence.motion).to(device)
 
     def rebind(self) -> None:
         """Prepares again what depends on the set of Gaussians; after densification."""
@@ -166,18 +163,16 @@ class Stepper:
         )
 
     def _frame(self, index: int) -> _Frame:
-        return _Frame(
-            Coefficients(self._expression[index], self._driver[index]),
-            self._features[index],
-            self._transforms[index],
-        )
+        return _Frame(self._coefficients(self._psi[index]), self._features[index], self._transforms[index])
+
+    def _coefficients(self, psi: Float[Tensor, " k"]) -> Coefficients:
+        own, mixer = self._template.n_expressions + self._template.n_eyelids, self.state.mixer
+        return Coefficients(psi[:own] if mixer is None else mixer.values(psi), psi[own:], psi)
 
     def _motion(self, motion: HeadMotion) -> _Frame:
         template, device = self._template, self._kernels.device
-        psi = template.coefficients(motion).to(device)
-        n = self._expression.shape[-1]
         return _Frame(
-            Coefficients(psi[:n], psi[n:]),
+            self._coefficients(template.signals(motion).to(device)),
             template.pose_feature(motion).to(device),
             template.transforms(motion).to(device),
         )
