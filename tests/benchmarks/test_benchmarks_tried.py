@@ -20,7 +20,7 @@ def layer(padding: int = 1, slope: float | None = 0.2) -> FixedConv:
 @pytest.mark.parametrize("size", [(16, 20), (13, 11), (3, 30)])
 def test_winograds_convolution_is_the_convolution(size: tuple[int, int], padding: int) -> None:
     conv, x = layer(padding), torch.randn(2, 12, *size, generator=torch.Generator().manual_seed(1))
-    assert torch.allclose(WinogradConv(conv)(x), conv(x), atol=2e-5)
+    assert torch.allclose(WinogradConv(conv)(x), conv(x), atol=1e-4)
 
 
 def test_int8_is_within_its_steps() -> None:
