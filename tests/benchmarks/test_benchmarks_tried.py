@@ -26,4 +26,4 @@ def test_winograds_convolution_is_the_convolution(size: tuple[int, int], padding
 def test_int8_is_within_its_steps() -> None:
     conv, x = layer(slope=None), torch.randn(1, 12, 24, 18, generator=torch.Generator().manual_seed(1))
     error = (Int8Conv(conv)(x) - conv(x)).square().mean() / conv(x).square().mean()
-    assert 1e-6 < error < 1e-3
+    assert 1e-6 < error < 3e-4
