@@ -39,6 +39,9 @@ BLOCK = 1 << 22
 MIN_PAIRS, MIN_CHANNELS = 256 * 512, 32
 """Least input times output channels for Winograd, least channels on a side for int8."""
 
+LARGEST = 63
+"""Of int8 kernels: without VNNI, sums of two products are cut off at 16 bits, and 127 would get there."""
+
 
 @dataclass(frozen=True)
 class Attempt:
@@ -197,7 +200,7 @@ class Int8Conv(nn.Module):
         super().__init__()
         self.bias, self.slope = conv.bias, conv.slope
         self.places = [conv.stride] * 2, [conv.padding] * 2, [conv.dilation] * 2, 1
-        self.scale = conv.weight.abs().amax((1, 2, 3)) / 127
+        self.scale = conv.weight.abs().amax((1, 2, 3)) / LARGEST
         rounded = (conv.weight.contiguous() / self.scale[:, None, None, None]).round().to(torch.int8)
         self.zeros = torch.zeros(len(rounded), dtype=torch.int32)
         self.kernel = torch.ops.onednn.qconv_prepack(rounded, self.scale, 1.0, 128, *self.places, None)
