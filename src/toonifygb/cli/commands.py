@@ -56,7 +56,7 @@ def create(
         track_on: Video whose landmarks the head model is fitted to.
         head: Head model: open, or flame or flame2023 once you have added it (toonifygb assets add flame).
         choose_face: Which face to follow: largest, left, right, centre, or a number counted from the left.
-        blendshapes: full, or reduced: a few learned bases for all expressions, for smaller and faster avatars.
+        blendshapes: full, or reduced: a few learned bases for all expressions, for smaller avatars.
         n_bases: Learned bases of reduced blendshapes, 20 when unset; of full ones, expression units kept.
         max_frames: Use only the first frames.
         backend: Rasteriser: auto, cuda, gsplat, native or reference.
