@@ -107,18 +107,23 @@ def test_interrupted_twice_equals_uninterrupted(tmp_path: Path) -> None:
 
 
 def _stylises_a_clip(style_file: Path) -> None:
-    """The trained style draws frames of the source's size, and other ones than they were."""
-    style = stylize.get(str(style_file), StyleganexConfig(size="super"))
+    """The trained style draws other frames than they were, of the source's size or of the network's own."""
     assert stylize.files(str(style_file)) == (style_file,)
     rng = np.random.default_rng(1)
     frames = list(rng.integers(0, 255, (2, 72, 96, 3), dtype=np.uint8))
     points = torch.from_numpy(rng.normal((48, 36), 12, (478, 2)).astype(np.float32)).expand(2, -1, -1)
     marks = Landmarks(points.clone(), torch.ones(2), 96, 72)
-    state = stylize.prepare(iter(frames), marks, style)
-    drawn = list(stylize.stylize_frames(iter(frames), marks, style, state))
-    height, width = CropRule.from_state(state["rule"]).size
-    assert [frame.shape for frame in drawn] == [(height, width, 3)] * 2, "six levels, as it was trained, and not 4x"
-    assert len(np.unique(drawn[0])) > 20
+    for size in ("source", "super"):
+        style = stylize.get(str(style_file), StyleganexConfig(size=size))
+        state = stylize.prepare(iter(frames), marks, style)
+        drawn = list(stylize.stylize_frames(iter(frames), marks, style, state))
+        if size == "source":
+            assert [frame.shape for frame in drawn] == [(72, 96, 3)] * 2
+            assert np.abs(drawn[0].astype(int) - frames[0]).max() > 20
+        else:
+            height, width = CropRule.from_state(state["rule"]).size
+            assert [frame.shape for frame in drawn] == [(height, width, 3)] * 2, "six levels, as trained, not 4x"
+            assert len(np.unique(drawn[0])) > 20
 
 
 def test_a_diverged_training_is_not_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
