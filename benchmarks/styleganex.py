@@ -22,6 +22,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from benchmarks.harness import ROOT, Figure, cpu_seconds
 from toonifygb.stylize.styleganex import PUBLISHED
 from toonifygb.stylize.styleganex.fast import compile_clip
+from toonifygb.threads import one_torch_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -40,18 +41,19 @@ CORES = 2
 
 def run() -> list[Figure]:
     """Seconds of one core per frame, dB, GB, and multiply-adds per second beside a large matrix product's."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with one_torch_thread():
         return measured()
-    finally:
-        torch.set_num_threads(threads)
+
+
+def seeded_network() -> StyleGANEX:
+    """The network of full width with weights from a seed."""
+    make = runpy.run_path(str(ROOT / "tests" / "stylize" / "styleganex_weights.py"))["make_network"]
+    return make(PUBLISHED["toonify"]).requires_grad_(False)
 
 
 def measured() -> list[Figure]:
     """All figures."""
-    make = runpy.run_path(str(ROOT / "tests" / "stylize" / "styleganex_weights.py"))["make_network"]
-    network: StyleGANEX = make(PUBLISHED["toonify"]).requires_grad_(False)
+    network = seeded_network()
     peaks = {dtype: matmul_rate(dtype) for dtype in NAMES}
     rng = torch.Generator().manual_seed(1)
     face = smooth_image(256, rng)

@@ -12,7 +12,6 @@ Runs only when named, takes about half an hour of two cores, and needs Linux, wh
 from __future__ import annotations
 
 import os
-import runpy
 import signal
 import subprocess
 import sys
@@ -27,8 +26,9 @@ import cv2
 import numpy as np
 
 from benchmarks.harness import ROOT, Figure
+from benchmarks.styleganex import seeded_network
 from toonifygb import video
-from toonifygb.stylize.styleganex import PUBLISHED, weights
+from toonifygb.stylize.styleganex import weights
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -60,8 +60,7 @@ def measured(folder: Path) -> list[Figure]:
     """All figures, with the files in ``folder``."""
     clip, style = folder / "clip.mp4", folder / "style.safetensors"
     make_clip(clip)
-    make = runpy.run_path(str(ROOT / "tests" / "stylize" / "styleganex_weights.py"))["make_network"]
-    weights.save(make(PUBLISHED["toonify"]), style)
+    weights.save(seeded_network(), style)
     whole, halved = folder / "whole.mp4", folder / "killed.mp4"
     with ThreadPoolExecutor(1) as beside:
         running = beside.submit(watched, clip, style, whole)

@@ -8,7 +8,6 @@ styles. ITF and ISI count the subject's motion too; the flow-warped error takes 
 
 from __future__ import annotations
 
-import runpy
 from dataclasses import replace
 from itertools import islice, pairwise
 from typing import TYPE_CHECKING
@@ -17,18 +16,19 @@ import cv2
 import numpy as np
 import torch
 
-from benchmarks.harness import ROOT, Figure
+from benchmarks.harness import Figure
+from benchmarks.styleganex import seeded_network
 from benchmarks.styleganex_clip import squares
 from benchmarks.stylize import styled, warped_error
 from toonifygb import face, stylize
 from toonifygb.config import FaceConfig, StyleganexConfig
 from toonifygb.metrics import psnr, stability
 from toonifygb.stylize import filters, steady
-from toonifygb.stylize.styleganex import PUBLISHED
 from toonifygb.stylize.styleganex.aligned import AlignedStylizer
 from toonifygb.stylize.styleganex.engine import Engine
 from toonifygb.stylize.styleganex.fast import compile_clip
 from toonifygb.stylize.styleganex.stylizer import StyleganexStylizer
+from toonifygb.threads import one_torch_thread
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -53,20 +53,15 @@ SAME = 2
 
 def run() -> list[Figure]:
     """ITF in dB, ISI, flow-warped error in levels; baselines are the source's."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with one_torch_thread():
         return measured()
-    finally:
-        torch.set_num_threads(threads)
 
 
 def measured() -> list[Figure]:
     """All figures."""
     clip = list(islice(squares(), FRAMES))
     marks, _ = face.find_landmarks(clip, FaceConfig())
-    make = runpy.run_path(str(ROOT / "tests" / "stylize" / "styleganex_weights.py"))["make_network"]
-    network: StyleGANEX = make(PUBLISHED["toonify"]).requires_grad_(False)
+    network = seeded_network()
     toon = stylize.get("toon")
     drawn = {"source": clip, "toon": styled(clip, marks, toon, stylize.prepare(iter(clip), marks, toon))}
     for name, config in VERSIONS.items():

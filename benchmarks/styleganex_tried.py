@@ -6,7 +6,6 @@ size. ``docs/decisions/033`` says what came out. Runs only when named.
 
 from __future__ import annotations
 
-import runpy
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -15,18 +14,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from benchmarks.harness import ROOT, Figure
-from benchmarks.styleganex import decibels, smooth_image
-from toonifygb.stylize.styleganex import PUBLISHED
+from benchmarks.harness import Figure
+from benchmarks.styleganex import decibels, seeded_network, smooth_image
 from toonifygb.stylize.styleganex.fast import compile_clip
 from toonifygb.stylize.styleganex.folded import FixedConv
+from toonifygb.threads import one_torch_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from jaxtyping import Float, UInt8
 
-    from toonifygb.stylize.styleganex import StyleGANEX
 
 SIDE, LEVELS, REPEATS = 352, 6, 3
 OUT, TAPS = 4, 3
@@ -54,18 +52,13 @@ class Attempt:
 
 def run() -> list[Figure]:
     """Seconds of one core per frame beside the network as it is, and dB between the two."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with one_torch_thread():
         return measured()
-    finally:
-        torch.set_num_threads(threads)
 
 
 def measured() -> list[Figure]:
     """All figures."""
-    make = runpy.run_path(str(ROOT / "tests" / "stylize" / "styleganex_weights.py"))["make_network"]
-    network: StyleGANEX = make(PUBLISHED["toonify"]).requires_grad_(False)
+    network = seeded_network()
     rng = torch.Generator().manual_seed(1)
     with torch.inference_mode():
         w_plus, frame = network.codes(smooth_image(256, rng)), smooth_image(SIDE, rng)

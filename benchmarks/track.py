@@ -20,6 +20,7 @@ from toonifygb import synthetic, track
 from toonifygb.config import TrackConfig
 from toonifygb.head import HeadModel
 from toonifygb.structures import Landmarks, TrackedSequence
+from toonifygb.threads import one_torch_thread
 
 FPS = {"wojtek_1": 25.0, "d0": 25.0, "d9": 30.0, "pexels_8136210": 50.0}
 N_SYNTHETIC = 100
@@ -30,12 +31,8 @@ NOISE_PX = 1.0
 def run() -> list[Figure]:
     """Errors in px, degrees and mm; times in ms of processor time per frame on one thread."""
     head = heads.load("open")
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with one_torch_thread():
         return [*synthetic_figures(head), *clip_figures(head)]
-    finally:
-        torch.set_num_threads(threads)
 
 
 def synthetic_figures(head: HeadModel) -> list[Figure]:
