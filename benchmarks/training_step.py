@@ -108,7 +108,7 @@ def parts() -> list[Figure]:
             lambda: plain.l1_dssim(image, target),
         ),
         "Adam, blendshapes": (
-            lambda: native.blend_adam_step(deltas, first, second, psi, gradient, rates, 10),
+            lambda: native.blend_adam_step(deltas, first, second, psi[None], gradient[None], rates, 10),
             plain_blend_adam,
         ),
         "Adam, neutral": (

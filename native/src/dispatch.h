@@ -13,6 +13,8 @@ struct Kernels {
   void (*project_backward)(Frame&, const Scene&, const Gradients&);
   void (*blend)(const float* base, const void* deltas, bool bf16, const float* psi, int k, int64_t p, float* out,
                 int threads);
+  void (*add_blends)(const float* deltas, const float* psi, int frames, int k, int64_t p, float* out, int64_t stride,
+                     int threads);
   void (*adam)(float* parameters, float* first, float* second, const float* gradient, const float* rates, int64_t p,
                const AdamRates& adam_rates, int threads);
   void (*blend_adam)(const BlendState& state, const AdamRates& adam_rates, int threads);
@@ -20,6 +22,7 @@ struct Kernels {
                      float dssim_weight, float* gradient, SimilarityWork& work, int threads);
   void (*skin)(const Skin& input, const SkinOutput& output, int threads);
   void (*skin_backward)(const Skin& input, const SkinOutput& upstream, const SkinGradient& gradient, int threads);
+  void (*place)(const Picture& picture, int factor, float* color, float* matte, int threads);
   double (*measure_flops)();
 };
 

@@ -12,6 +12,11 @@ TGB_API void tgb_blend(const float* base, const void* deltas, int32_t bf16, cons
   tgb::kernels().blend(base, deltas, bf16 != 0, psi, k, p, out, threads);
 }
 
+TGB_API void tgb_add_blends(const float* deltas, const float* psi, int32_t frames, int32_t k, int64_t p, float* out,
+                            int64_t stride, int32_t threads) {
+  tgb::kernels().add_blends(deltas, psi, frames, k, p, out, stride, threads);
+}
+
 TGB_API void tgb_adam(float* parameters, float* first, float* second, const float* gradient, const float* rates,
                       int64_t p, const tgb::AdamRates* adam_rates, int32_t threads) {
   tgb::kernels().adam(parameters, first, second, gradient, rates, p, *adam_rates, threads);
@@ -28,6 +33,16 @@ TGB_API void tgb_skin(const tgb::Skin* input, const tgb::SkinOutput* output, int
 TGB_API void tgb_skin_backward(const tgb::Skin* input, const tgb::SkinOutput* upstream,
                                const tgb::SkinGradient* gradient, int32_t threads) {
   tgb::kernels().skin_backward(*input, *upstream, *gradient, threads);
+}
+
+// Returns 0 when out of memory.
+TGB_API int tgb_place(const tgb::Picture* picture, int32_t factor, float* color, float* matte, int32_t threads) {
+  try {
+    tgb::kernels().place(*picture, factor, color, matte, threads);
+    return 1;
+  } catch (const std::bad_alloc&) {
+    return 0;
+  }
 }
 
 // Returns the loss, or NaN when out of memory.

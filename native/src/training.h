@@ -16,11 +16,11 @@ struct AdamRates {
 // Deltas [k, p], row by row, and what a step of Adam needs of them.
 struct BlendState {
   float *deltas, *first_moment, *second_moment;
-  const float *psi, *gradient, *learning_rates;  // [k], [p], [p]
+  const float *psi, *gradient, *learning_rates;  // [frames, k], [frames, p], [p]
   const float* scale;                            // [k, n] factor of the step per row and Gaussian, or null
   const int32_t* widths;                         // floats per Gaussian of each parameter group; sum x n = p
   int64_t p;
-  int32_t k, n, groups, skip_inactive;
+  int32_t k, n, groups, skip_inactive, frames;
 };
 
 constexpr int kJoints = 5;
@@ -36,6 +36,13 @@ struct SkinOutput {  // splats, or d loss / d splats (then sh_frames is not used
 };
 struct SkinGradient {
   float *means, *quats, *log_scales, *opacity_logits;
+};
+
+// A frame of sRGB bytes [height, width, 3], its matte [height, width] 0..1, and what goes behind it.
+struct Picture {
+  const uint8_t* frame;
+  const float *matte, *background;  // background [3]
+  int32_t height, width;
 };
 
 // Kept between calls.

@@ -111,6 +111,10 @@ class TrainConfig:
     """Side of the square head crop that is trained on, px."""
     steps: int = 3_000
     """Optimiser steps, one frame each."""
+    coarse_share: float = 0.0
+    """Share of the steps, the first ones, that compare at half the resolution."""
+    delta_frames: int = 1
+    """Steps to every step of the blendshapes' changes, which are most of the numbers and move slowly."""
     sh_degree: int = 1
     """Degree of the view-dependent colour, reached step by step."""
     blendshapes: Blendshapes = "full"

@@ -95,8 +95,9 @@ def test_blend(cuda_kernels: Kernels, dtype: torch.dtype) -> None:
     torch.testing.assert_close(base.double(), expected, rtol=0, atol=5e-6)
 
 
+@pytest.mark.parametrize("frames", [1, 3])
 @pytest.mark.parametrize("scaled", [False, True])
-def test_adam(cuda_kernels: Kernels, scaled: bool) -> None:
+def test_adam(cuda_kernels: Kernels, scaled: bool, frames: int) -> None:
     device = cuda_kernels.device
     rates = learning_rates(WIDTHS, (1e-3, 2e-3, 3e-3, 4e-3, 2e-3), N).to(device)
     scale = (torch.rand(K, N) * (torch.rand(K, N) > 0.4)).to(device) if scaled else None
@@ -104,7 +105,8 @@ def test_adam(cuda_kernels: Kernels, scaled: bool) -> None:
     found = tuple(tensor.to(device) for tensor in (torch.randn(K, P), torch.zeros(K, P), torch.zeros(K, P)))
     start, expected = found[0].clone(), doubles(found)
     for step in range(1, 4):
-        psi, gradient = coefficients()[:K].roll(step).to(device), torch.randn(P).to(device)
+        psi = torch.stack([coefficients()[:K].roll(step + b) for b in range(frames)]).to(device)
+        gradient = torch.randn(frames, P).to(device)
         options = {"widths": WIDTHS, "skip_inactive": step % 2 == 0, "factor": 0.5}
         cuda_kernels.blend_adam_step(*found, psi, gradient, rates, step, scale=scale, **options)
         wide = None if scale is None else scale.double()
@@ -114,8 +116,8 @@ def test_adam(cuda_kernels: Kernels, scaled: bool) -> None:
     assert torch.equal(found[0][~live], start[~live])
     row = [tensor[0] for tensor in found]
     wide_row = doubles(tuple(row))
-    cuda_kernels.adam_step(*row, gradient, rates, 4)
-    DEFINITION.adam_step(*wide_row, *doubles((gradient, rates)), 4)
+    cuda_kernels.adam_step(*row, gradient[0], rates, 4)
+    DEFINITION.adam_step(*wide_row, *doubles((gradient[0], rates)), 4)
     torch.testing.assert_close(row[0].double()[live[0]], wide_row[0][live[0]], rtol=1e-5, atol=1e-6)
 
 

@@ -58,6 +58,34 @@ def test_blend_does_not_read_inactive_rows(kernels: Kernels) -> None:
     assert torch.equal(kernels.blend(torch.zeros(50), deltas, psi), torch.full((50,), 0.5))
 
 
+@pytest.mark.parametrize("frames", [1, 3])
+def test_blends_of_several_frames_add_up(kernels: Kernels, frames: int) -> None:
+    deltas, psi = torch.randn(K, P), torch.stack([coefficients().roll(b) for b in range(frames)])
+    start = torch.randn(frames, P + 7)
+    out = start.clone()
+    kernels.add_blends(out, deltas, psi)
+    expected = start[:, :P].double() + psi.double() @ deltas.double()
+    torch.testing.assert_close(out[:, :P].double(), expected, rtol=0, atol=5e-6)
+    assert torch.equal(out[:, P:], start[:, P:])
+    for b in range(frames):  # no frame depends on which others it is computed with
+        alone = start[b : b + 1].clone()
+        kernels.add_blends(alone, deltas, psi[b : b + 1])
+        assert kernels.name == "reference" or torch.equal(alone[0], out[b])
+
+
+@pytest.mark.parametrize("size", [(2, 2), (6, 10), (50, 34)])
+@pytest.mark.parametrize("factor", [1, 2])
+def test_a_picture_on_a_background(kernels: Kernels, size: tuple[int, int], factor: int) -> None:
+    frame = torch.randint(0, 256, (*size, 3), dtype=torch.uint8)
+    matte, background = torch.rand(size), torch.tensor([0.1, 0.5, 0.9])
+    color, small = kernels.place(frame, matte, background, factor)
+    shares = matte.double()[..., None]
+    wanted = frame.double() / 255 * shares + background.double() * (1 - shares)
+    pooled = torch.nn.functional.avg_pool2d(torch.cat([wanted, shares], -1).movedim(-1, 0), factor).movedim(0, -1)
+    torch.testing.assert_close(color.double(), pooled[..., :3], rtol=0, atol=1e-6)
+    torch.testing.assert_close(small.double(), pooled[..., 3], rtol=0, atol=1e-6)
+
+
 def test_adam_step_is_torch_adam(kernels: Kernels) -> None:
     dtype = torch.float64 if kernels.name == "reference" else torch.float32
     ours = torch.randn(999, dtype=dtype)
@@ -93,15 +121,34 @@ def test_consistency_scale_is_adam_on_the_unscaled_deltas(rates: Tensor) -> None
         hidden.grad = factor * psi[:, None] * gradient
         optimizer.step()
         DEFINITION.blend_adam_step(
-            *applied, psi, gradient, torch.ones(P, dtype=torch.float64), step, scale=scale, widths=WIDTHS
+            *applied,
+            psi[None],
+            gradient[None],
+            torch.ones(P, dtype=torch.float64),
+            step,
+            scale=scale,
+            widths=WIDTHS,
         )
     torch.testing.assert_close(applied[0], factor * hidden.detach(), rtol=1e-9, atol=1e-9)
 
 
+def test_a_step_over_several_frames_takes_the_sum_of_their_gradients(kernels: Kernels, rates: Tensor) -> None:
+    psi, gradient = torch.stack([coefficients().roll(i) for i in range(3)]), torch.randn(3, P)
+    found, expected = ((torch.zeros(K, P), torch.zeros(K, P), torch.zeros(K, P)) for _ in range(2))
+    kernels.blend_adam_step(*found, psi, gradient, rates, 1)
+    for k in range(K):
+        DEFINITION.adam_step(*(part[k] for part in expected), psi[:, k] @ gradient, rates, 1)
+    # Adam's first step is the sign of the gradient: moments show more
+    torch.testing.assert_close(found[1], expected[1], rtol=0, atol=1e-6)
+    torch.testing.assert_close(found[2], expected[2], rtol=0, atol=1e-6)
+    assert (psi.abs() > 0).sum(0).max() > 1
+
+
+@pytest.mark.parametrize("frames", [1, 3])
 @pytest.mark.parametrize("scaled", [False, True])
 @pytest.mark.parametrize("skip_inactive", [False, True])
 def test_native_blend_adam_agrees(
-    native_kernels: Kernels, rates: Tensor, scaled: bool, skip_inactive: bool
+    native_kernels: Kernels, rates: Tensor, scaled: bool, skip_inactive: bool, frames: int
 ) -> None:
     scale = torch.rand(K, N) * (torch.rand(K, N) > 0.4) if scaled else None
     live = torch.ones(K, P, dtype=torch.bool) if scale is None else expand_scale(scale, WIDTHS) != 0
@@ -109,7 +156,8 @@ def test_native_blend_adam_agrees(
     start = found[0].clone()
     expected = doubles(found)
     for step in range(1, 6):
-        psi, gradient = coefficients().roll(step), torch.randn(P)
+        psi = torch.stack([coefficients().roll(step + b) for b in range(frames)])
+        gradient = torch.randn(frames, P)
         options = {"widths": WIDTHS, "skip_inactive": skip_inactive, "factor": 0.5 + 0.1 * step}
         native_kernels.blend_adam_step(*found, psi, gradient, rates, step, scale=scale, **options)
         wide_scale = None if scale is None else scale.double()
@@ -124,9 +172,9 @@ def test_inactive_rows_coast_unless_skipped(kernels: Kernels, rates: Tensor) -> 
     moved = {}
     for skip_inactive in (False, True):
         state = (torch.zeros(K, P), torch.zeros(K, P), torch.zeros(K, P))
-        gradient, psi = torch.randn(P), torch.ones(K)
+        gradient, psi = torch.randn(2, P), torch.ones(2, K)
         kernels.blend_adam_step(*state, psi, gradient, rates, 1, skip_inactive=skip_inactive)
-        before, psi[2] = state[0].clone(), 0
+        before, psi[:, 2] = state[0].clone(), 0
         kernels.blend_adam_step(*state, psi, gradient, rates, 2, skip_inactive=skip_inactive)
         moved[skip_inactive] = (state[0] - before)[2].abs().max().item()
     assert moved[True] == 0 < moved[False]
@@ -192,7 +240,7 @@ def test_threads_do_not_change_a_bit(native_kernels: Kernels, rates: Tensor) -> 
         image, target = torch.rand(2, 70, 45, 3, generator=random)
         blended = kernels.blend(base, state[0], psi)
         kernels.blend_adam_step(
-            *state, psi, base, rates, 4, scale=torch.rand(K, N, generator=random), widths=WIDTHS
+            *state, psi[None], base[None], rates, 4, scale=torch.rand(K, N, generator=random), widths=WIDTHS
         )
         kernels.adam_step(*(row[0] for row in state), base, rates, 4)
         torch.manual_seed(5)
@@ -213,5 +261,5 @@ def test_scale_must_fit(kernels: Kernels) -> None:
     state = tuple(torch.zeros(2, 8) for _ in range(3))
     with pytest.raises(ValueError, match=r"expected \(2, n\) with n"):
         kernels.blend_adam_step(
-            *state, torch.ones(2), torch.ones(8), torch.ones(8), 1, scale=torch.ones(2, 3), widths=(1, 3)
+            *state, torch.ones(1, 2), torch.ones(1, 8), torch.ones(8), 1, scale=torch.ones(2, 3), widths=(1, 3)
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -18,10 +18,10 @@ from toonifygb.avatar.fields import FIELDS, join
 from toonifygb.avatar.skinning import activate, scale_deltas
 from toonifygb.errors import InputError
 from toonifygb.progress import Stopped
-from toonifygb.structures import GaussianParams, TrackedSequence
+from toonifygb.structures import Camera, GaussianParams, Rendering, Splats, TrackedSequence
 from toonifygb.train import Dataset, build_dataset, evaluate, first_avatar, train
 from toonifygb.train.densify import DensifyRules
-from toonifygb.train.losses import LossWeights, image_loss, mouth_loss, placed_on
+from toonifygb.train.losses import LossWeights, image_loss, mouth_gradients, mouth_loss
 from toonifygb.train.optim import (
     BASIS_EPS,
     DELTA_EPS,
@@ -32,6 +32,7 @@ from toonifygb.train.optim import (
     MIXER_EPS,
     MIXER_RATE,
     NEUTRAL_RATES,
+    RATE_GROWTH,
     means_decay,
     mixer_gradient,
     settling,
@@ -45,6 +46,8 @@ if TYPE_CHECKING:
     from toonifygb.config import TrainConfig
 
 REDUCED = replace(TINY, blendshapes="reduced", n_bases=4)
+SLOW = replace(TINY, delta_frames=4, coarse_share=0.3)
+REDUCED_SLOW = replace(REDUCED, delta_frames=4)
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +79,8 @@ def same(a: Avatar, b: Avatar) -> bool:
 class PlainTraining:
     """The training written with autograd, ``Avatar.pose`` and ``torch.optim.Adam``."""
 
-    def __init__(self, template: Avatar) -> None:
+    def __init__(self, template: Avatar, delta_frames: int) -> None:
+        self.frames = delta_frames
         self.state = TrainState.start(template, TINY.seed)
         self.template = template
         self.scale = torch.ones(len(template.deltas.means), self.state.counts.face)
@@ -89,18 +93,24 @@ class PlainTraining:
             template.deltas.map(lambda t, rows=rows: torch.zeros_like(t[rows]).requires_grad_())
             for rows in self.parts
         ]
-        self.groups = []
+        self.groups, self.delta_groups = [], []
+        growth = delta_frames**RATE_GROWTH
         for name in FIELDS:
             key = "sh_dc" if name == "sh" else name
             faster = FULL_STEPS / TINY.steps if name in {"means", "opacity_logits"} else 1
             self.add([getattr(part, name) for part in self.sets], NEUTRAL_RATES[key], name != "means", 1e-15)
             own, driver = (getattr(part, name) for part in self.trained)
-            self.add([own], DELTA_RATES[key] * faster, True, DELTA_EPS if template.mixer is None else BASIS_EPS)
-            self.add([driver], DRIVER_TRAVEL[key] / TINY.steps, True, DELTA_EPS)
+            own_eps, rate = DELTA_EPS if template.mixer is None else BASIS_EPS, DELTA_RATES[key] * faster
+            for tensor, lr, eps in (
+                (own, rate, own_eps),
+                (driver, DRIVER_TRAVEL[key] / TINY.steps, DELTA_EPS),
+            ):
+                self.delta_groups.append({"params": [tensor], "lr": growth * lr, "settles": True, "eps": eps})
         self.mixer = None if template.mixer is None else template.mixer.map(lambda t: t.clone().requires_grad_())
         if self.mixer is not None:
             self.add([getattr(self.mixer, name) for name in LEARNED], MIXER_RATE, True, MIXER_EPS)
         self.adam = torch.optim.Adam([dict(group) for group in self.groups])
+        self.delta_adam = torch.optim.Adam([dict(group) for group in self.delta_groups])
         self.volume = MouthVolume.around(join([template.mouth_upper, template.mouth_lower]).means)
 
     def add(self, tensors: list[torch.Tensor], rate: float, settles: bool, eps: float) -> None:
@@ -111,9 +121,10 @@ class PlainTraining:
         return GaussianParams(**{name: getattr(fixed, name) + getattr(trained, name) for name in FIELDS})
 
     def damped_step(self) -> None:
-        """Adam's step, of which the deltas take the share that blendshape consistency allows."""
+        """Adam's step of the deltas, which take the share of it that blendshape consistency allows."""
         before = [part.map(lambda t: t.detach().clone()) for part in self.trained]
-        self.adam.step()
+        self.delta_adam.step()
+        self.delta_adam.zero_grad()
         with torch.no_grad():
             for part, old, rows in zip(self.trained, before, self.parts, strict=True):
                 change = GaussianParams(**{name: getattr(part, name) - getattr(old, name) for name in FIELDS})
@@ -133,14 +144,17 @@ class PlainTraining:
         )
         weights = LossWeights.of(TINY)
         color, matte = dataset.target(index)
-        loss = image_loss(image, placed_on(background, color, matte), matte, weights)
+        loss = image_loss(image, color + (1 - matte)[..., None] * background, matte, weights)
         loss = loss + mouth_loss(upper.means, lower.means, self.volume, weights)
         self.adam.zero_grad()
         loss.backward()
         share = self.state.step / TINY.steps
-        for group, first in zip(self.adam.param_groups, self.groups, strict=True):
-            group["lr"] = first["lr"] * (settling(share) if group["settles"] else means_decay(share))
-        self.damped_step()
+        for adam, groups in ((self.adam, self.groups), (self.delta_adam, self.delta_groups)):
+            for group, first in zip(adam.param_groups, groups, strict=True):
+                group["lr"] = first["lr"] * (settling(share) if group["settles"] else means_decay(share))
+        self.adam.step()
+        if self.state.step % self.frames == 0:  # until then the gradients of the deltas add up
+            self.damped_step()
 
 
 class DegreeZero(Stepper):
@@ -149,9 +163,11 @@ class DegreeZero(Stepper):
     sh_degree = 0  # type: ignore[assignment]
 
 
-@pytest.mark.parametrize("config", [TINY, REDUCED], ids=["full", "reduced"])
+@pytest.mark.parametrize(
+    "config", [TINY, replace(TINY, delta_frames=2), REDUCED], ids=["full", "two frames", "reduced"]
+)
 def test_fast_step_equals_the_plain_one(clip: tuple[Dataset, TrackedSequence], config: TrainConfig) -> None:
-    """Two steps, every parameter."""
+    """Two steps of the deltas, every parameter."""
     dataset, sequence = clip
     template = first_avatar(dataset, sequence, tiny_head(), config)
     # Round Gaussians have no gradient for their rotation, and unturned ones none for w, but rounding noise, of
@@ -159,10 +175,11 @@ def test_fast_step_equals_the_plain_one(clip: tuple[Dataset, TrackedSequence], c
     stretched = template.neutral.log_scales + torch.tensor([0.4, 0.0, -0.4])
     turned = template.neutral.quats + torch.tensor([0.3, 0.5, -0.4, 0.2])
     template = replace(template, neutral=replace(template.neutral, log_scales=stretched, quats=turned))
-    state, plain = TrainState.start(template, TINY.seed), PlainTraining(template)
+    state, plain = TrainState.start(template, TINY.seed), PlainTraining(template, config.delta_frames)
     first = join([template.neutral, template.mouth_upper, template.mouth_lower])
-    stepper = DegreeZero(state, template, dataset, sequence, TINY, render.get("auto", 1), render.kernels("auto", 1))
-    for _ in range(2):
+    backends = render.get("auto", 1), render.kernels("auto", 1)
+    stepper = DegreeZero(state, template, dataset, sequence, config, *backends)
+    for _ in range(2 * config.delta_frames):
         stepper.step()
         plain.step(dataset, sequence)
     n_face, n_expression = state.counts.face, template.n_bases
@@ -191,7 +208,7 @@ def test_fast_step_equals_the_plain_one(clip: tuple[Dataset, TrackedSequence], c
             assert wrong < 0.02, (group, name, float(wrong))
             assert (expected != 0).any(), (group, name)
     if state.mixer is None or plain.mixer is None:
-        assert config is TINY
+        assert config is not REDUCED
         return
     for name in LEARNED:
         mixers = (template.mixer, state.mixer.values, plain.mixer)
@@ -219,7 +236,9 @@ def test_slope_of_the_network_equals_autograd() -> None:
         assert torch.allclose(slope, expected), name
 
 
-@pytest.mark.parametrize(("grow", "base"), [(False, TINY), (True, TINY), (True, REDUCED)])
+@pytest.mark.parametrize(
+    ("grow", "base"), [(False, TINY), (True, TINY), (True, REDUCED), (True, SLOW), (False, REDUCED_SLOW)]
+)
 def test_resumed_training_equals_a_straight_one(
     clip: tuple[Dataset, TrackedSequence],
     tmp_path: Path,
@@ -256,6 +275,38 @@ def test_resumed_training_equals_a_straight_one(
     assert same(straight, paused)
     finished_again = run(tmp_path / "paused")
     assert finished_again is not None and same(straight, finished_again)
+
+
+def test_first_steps_look_at_half_the_resolution(clip: tuple[Dataset, TrackedSequence]) -> None:
+    dataset, sequence = clip
+    config = replace(TINY, steps=4, coarse_share=0.5)
+    template, sizes = first_avatar(dataset, sequence, tiny_head(), config), []
+
+    class Watched(type(render.get("auto", 1))):
+        def render(self, splats: Splats, camera: Camera, **options: Any) -> Rendering:
+            sizes.append((camera.width, camera.height))
+            return super().render(splats, camera, **options)
+
+    state = TrainState.start(template, 0)
+    stepper = Stepper(state, template, dataset, sequence, config, Watched(), render.kernels("auto", 1))
+    for _ in range(config.steps):
+        stepper.step()
+    full = dataset.size
+    assert sizes == [(full // 2, full // 2)] * 2 + [(full, full)] * 2
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_slopes_of_the_mouth_equal_autograd(joint: bool) -> None:
+    points = (0.02 * torch.randn(60, 3, dtype=torch.float64)).requires_grad_()
+    volume = MouthVolume(torch.tensor([0.001, 0.002, -0.003]).double(), 0.02, 0.015)
+    weights = LossWeights(0.8, 0.2, 10.0, 100.0, joint_mouth_mean=joint)
+    loss = mouth_loss(points[:25], points[25:], volume, weights)
+    (wanted,) = torch.autograd.grad(loss, points)
+    found, slopes = mouth_gradients(points.detach(), 25, volume, weights)
+    assert found == pytest.approx(loss.item())
+    torch.testing.assert_close(slopes, wanted)
+    outside = (wanted != 0).any(-1)
+    assert 0 < outside.sum() < len(points)
 
 
 def test_checkpoint_round_trip_and_damage(clip: tuple[Dataset, TrackedSequence], tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 // Blendshape evaluation and Adam. All of it is bound by memory traffic: every delta is read once per evaluation, and
-// read and written once with its two moments per step; the gradient of row k, psi_k g, is never stored.
+// read and written once with its two moments per step; the gradient of row k, the sum of psi_k g over the frames of
+// the step, is never stored.
 #include "kernels.h"
 
 namespace tgb {
@@ -7,6 +8,7 @@ namespace TGB_ISA {
 namespace {
 
 constexpr int kSweep = 4096;    // parameters per blending task: they stay in the L1 cache while rows stream past
+constexpr int kFrameSweep = 2048;  // the same where several frames' sums share the cache
 constexpr int kLiveBlock = 64;    // Gaussians that are left out together where a row moves none of them
 constexpr int kAdamChunk = 8192;  // parameters per Adam task: gradient and rates stay in the L2 cache
 
@@ -38,6 +40,19 @@ inline void add_rows(const float* source, const T* const* rows, const float* wei
   }
 }
 
+constexpr int kRows = 4;  // deltas added in one pass
+
+template <class T>
+inline void add_rows(const float* source, const T* const* rows, const float* weights, int n, float* out, int count) {
+  switch (n) {
+    case 0: return;
+    case 1: return add_rows<1>(source, rows, weights, out, count);
+    case 2: return add_rows<2>(source, rows, weights, out, count);
+    case 3: return add_rows<3>(source, rows, weights, out, count);
+    default: add_rows<kRows>(source, rows, weights, out, count);
+  }
+}
+
 template <class T>
 void blend_typed(const float* base, const T* deltas, const float* psi, int k, int64_t p, float* out, int threads) {
   parallel_for(threads, static_cast<int>((p + kSweep - 1) / kSweep), [&](int task) {
@@ -45,18 +60,13 @@ void blend_typed(const float* base, const T* deltas, const float* psi, int k, in
     const int count = static_cast<int>(p - begin < kSweep ? p - begin : kSweep);
     const float* source = base + begin;
     for (int row = 0; row < k;) {
-      const T* rows[4];
-      float weights[4];
+      const T* rows[kRows];
+      float weights[kRows];
       int n = 0;
-      for (; row < k && n < 4; row++)
+      for (; row < k && n < kRows; row++)
         if (psi[row] != 0) rows[n] = deltas + row * p + begin, weights[n++] = psi[row];
-      switch (n) {
-        case 0: continue;
-        case 1: add_rows<1>(source, rows, weights, out + begin, count); break;
-        case 2: add_rows<2>(source, rows, weights, out + begin, count); break;
-        case 3: add_rows<3>(source, rows, weights, out + begin, count); break;
-        default: add_rows<4>(source, rows, weights, out + begin, count);
-      }
+      if (n == 0) continue;
+      add_rows(source, rows, weights, n, out + begin, count);
       source = out + begin;
     }
     if (source != out + begin)
@@ -108,13 +118,45 @@ inline bool scaled_rates(const float* rates, const float* scale, int width, int 
   return true;
 }
 
+// Whether any frame of the step shows row k.
+inline bool active(const BlendState& s, int k) {
+  for (int b = 0; b < s.frames; b++)
+    if (s.psi[static_cast<int64_t>(b) * s.k + k] != 0) return true;
+  return false;
+}
+
+// out = the gradient of row k, parameters [begin, begin + count): those of the frames, weighed by their psi_k.
+inline void sum_frames(const BlendState& s, int k, int64_t begin, int count, float* out) {
+  int i = 0;
+  for (; i + kWidth <= count; i += kWidth) {
+    F sum(0.f);
+    for (int b = 0; b < s.frames; b++)
+      sum = fma(F(s.psi[static_cast<int64_t>(b) * s.k + k]), load_unaligned(s.gradient + b * s.p + begin + i), sum);
+    store_unaligned(out + i, sum);
+  }
+  for (; i < count; i++) {
+    out[i] = 0;
+    for (int b = 0; b < s.frames; b++)
+      out[i] = __builtin_fmaf(s.psi[static_cast<int64_t>(b) * s.k + k], s.gradient[b * s.p + begin + i], out[i]);
+  }
+}
+
+// Parameters [begin, begin + count) of row k, with their learning rates.
+inline void adam_row(const BlendState& s, const AdamFactors& f, int k, int64_t begin, int count, const float* rates) {
+  float sum[kAdamChunk];
+  const float* gradient = s.gradient + begin;
+  float weight = s.psi[k];
+  if (s.frames > 1) sum_frames(s, k, begin, count, sum), gradient = sum, weight = 1;
+  const int64_t at = k * s.p + begin;
+  adam_range(f, weight, gradient, rates, s.deltas + at, s.first_moment + at, s.second_moment + at, count);
+}
+
 // Row k of Gaussians [g0, g1), a part of a task, of a group; nothing where the row moves none of them.
 inline void scaled_adam(const BlendState& s, const AdamFactors& f, int64_t offset, int width, int k, int g0, int g1) {
   float rates[kAdamChunk];
-  const int64_t begin = offset + static_cast<int64_t>(g0) * width, at = k * s.p + begin;
+  const int64_t begin = offset + static_cast<int64_t>(g0) * width;
   if (!scaled_rates(s.learning_rates + begin, s.scale + static_cast<int64_t>(k) * s.n, width, g0, g1, rates)) return;
-  adam_range(f, s.psi[k], s.gradient + begin, rates, s.deltas + at, s.first_moment + at, s.second_moment + at,
-             (g1 - g0) * width);
+  adam_row(s, f, k, begin, (g1 - g0) * width, rates);
 }
 
 // Task `task` of group `width` wide, starting at parameter `offset`: some Gaussians, all rows.
@@ -122,10 +164,9 @@ void blend_adam_task(const BlendState& s, const AdamFactors& f, int64_t offset, 
   const int g0 = task * per_task, g1 = imin(s.n, g0 + per_task), count = (g1 - g0) * width;
   const int64_t begin = offset + static_cast<int64_t>(g0) * width;
   for (int k = 0; k < s.k; k++) {
-    if (s.skip_inactive && s.psi[k] == 0) continue;
+    if (s.skip_inactive && !active(s, k)) continue;
     if (s.scale == nullptr)
-      adam_range(f, s.psi[k], s.gradient + begin, s.learning_rates + begin, s.deltas + k * s.p + begin,
-                 s.first_moment + k * s.p + begin, s.second_moment + k * s.p + begin, count);
+      adam_row(s, f, k, begin, count, s.learning_rates + begin);
     else
       for (int g = g0; g < g1; g += kLiveBlock)
         scaled_adam(s, f, offset, width, k, g, imin(g1, g + kLiveBlock));
@@ -140,6 +181,27 @@ void blend(const float* base, const void* deltas, bool bf16, const float* psi, i
     blend_typed(base, static_cast<const uint16_t*>(deltas), psi, k, p, out, threads);
   else
     blend_typed(base, static_cast<const float*>(deltas), psi, k, p, out, threads);
+}
+
+// Every sweep's deltas come from memory for the first frame and from the cache for the others.
+void add_blends(const float* deltas, const float* psi, int frames, int k, int64_t p, float* out, int64_t stride,
+                int threads) {
+  parallel_for(threads, static_cast<int>((p + kFrameSweep - 1) / kFrameSweep), [&](int task) {
+    const int64_t begin = static_cast<int64_t>(task) * kFrameSweep;
+    const int count = static_cast<int>(p - begin < kFrameSweep ? p - begin : kFrameSweep);
+    for (int row = 0; row < k; row += kRows)
+      for (int b = 0; b < frames; b++) {
+        const float* rows[kRows];
+        float weights[kRows];
+        int n = 0;
+        for (int r = row; r < imin(k, row + kRows); r++) {
+          const float weight = psi[static_cast<int64_t>(b) * k + r];
+          if (weight != 0) rows[n] = deltas + r * p + begin, weights[n++] = weight;
+        }
+        float* sums = out + b * stride + begin;
+        add_rows(sums, rows, weights, n, sums, count);
+      }
+  });
 }
 
 void adam(float* parameters, float* first, float* second, const float* gradient, const float* rates, int64_t p,

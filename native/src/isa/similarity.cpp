@@ -1,6 +1,6 @@
 // L1 + D-SSIM, value and gradient in two passes over the image.
 //
-// Pass 1 blurs a, b, a^2, b^2, ab and turns them into SSIM and its derivatives with respect to the blurred a, a^2, ab;
+// Pass 1 blurs a, b, a^2 + b^2, ab and turns them into SSIM and its derivatives with respect to the blurred a, a^2, ab;
 // pass 2 blurs those (the window is symmetric, so the blur is its own adjoint) and collects the gradient with
 // respect to a. Rows are interleaved RGB: a horizontal tap is 3 floats. Blurs are separable and kept in a ring of 11
 // horizontally filtered rows. Every row's sums are stored and added in row order.
@@ -82,19 +82,26 @@ struct Blur {
   }
 };
 
+// Lane by lane first: one long chain of additions would take as long as a blur.
 inline double row_sum(const float* row, int n) {
+  F lanes(0.f);
+  int i = 0;
+  for (; i + kWidth <= n; i += kWidth) lanes = lanes + load_unaligned(row + i);
+  float parts[kWidth];
+  store_unaligned(parts, lanes);
   double sum = 0;
-  for (int i = 0; i < n; i++) sum += row[i];
+  for (int lane = 0; lane < kWidth; lane++) sum += parts[lane];
+  for (; i < n; i++) sum += row[i];
   return sum;
 }
 
-// SSIM of a row from its blurred maps (a, b, a^2, b^2, ab), and derivatives by the blurred a, a^2 and ab.
+// SSIM of a row from its blurred maps (a, b, a^2 + b^2, ab), and derivatives by the blurred a, a^2 and ab.
 inline void ssim_row(float* const* blurred, float* ssim, float* by_a, float* by_aa, float* by_ab, int n) {
   const F c1(kSsimC1), c2(kSsimC2), two(2.f);
   for (int i = 0; i < n; i += kWidth) {
     const F ma = load_unaligned(blurred[0] + i), mb = load_unaligned(blurred[1] + i), product = ma * mb;
-    const F squares = fma(ma, ma, mb * mb), both_squares = load_unaligned(blurred[2] + i) + load_unaligned(blurred[3] + i);
-    const F A1 = fma(two, product, c1), A2 = fma(two, load_unaligned(blurred[4] + i) - product, c2);
+    const F squares = fma(ma, ma, mb * mb), both_squares = load_unaligned(blurred[2] + i);
+    const F A1 = fma(two, product, c1), A2 = fma(two, load_unaligned(blurred[3] + i) - product, c2);
     const F B1 = squares + c1, B2 = both_squares - squares + c2;
     const F inverse = F(1.f) / (B1 * B2), value = A1 * A2 * inverse, ratio = value * inverse;
     store_unaligned(ssim + i, value);
@@ -110,7 +117,7 @@ double l1_dssim(const float* image, const float* target, int height, int width, 
                 float* gradient, SimilarityWork& work, int threads) {
   const Window window;
   const int row = 3 * width, n = padded(row), bands = imax(1, imin(threads, height / 8));
-  const size_t plane = static_cast<size_t>(height) * n, per_band = Blur<5>::floats(row) + 4 * static_cast<size_t>(n);
+  const size_t plane = static_cast<size_t>(height) * n, per_band = Blur<4>::floats(row) + 4 * static_cast<size_t>(n);
   float* derivatives = work.derivatives.need(3 * plane);
   float* memory = work.bands.need(bands * per_band);
   double* sums = work.row_sums.need(2 * static_cast<size_t>(height));
@@ -119,14 +126,14 @@ double l1_dssim(const float* image, const float* target, int height, int width, 
   const size_t bytes = sizeof(float) * row;
 
   parallel_for(threads, bands, [&](int band) {
-    Blur<5> blur{window, memory + band * per_band, row, height};
-    float* ssim = memory + band * per_band + Blur<5>::floats(row);
+    Blur<4> blur{window, memory + band * per_band, row, height};
+    float* ssim = memory + band * per_band + Blur<4>::floats(row);
     const auto fill = [&](int y, float* const* out) {
       const size_t at = static_cast<size_t>(y) * row;
       memcpy(out[0], image + at, bytes), memcpy(out[1], target + at, bytes);
       for (int i = 0; i < n; i += kWidth) {
         const F a = load_unaligned(out[0] + i), b = load_unaligned(out[1] + i);
-        store_unaligned(out[2] + i, a * a), store_unaligned(out[3] + i, b * b), store_unaligned(out[4] + i, a * b);
+        store_unaligned(out[2] + i, fma(a, a, b * b)), store_unaligned(out[3] + i, a * b);
       }
     };
     const auto use = [&](int y, float* const* blurred) {
@@ -140,7 +147,7 @@ double l1_dssim(const float* image, const float* target, int height, int width, 
   const F l1_step(l1_weight * inverse), ssim_step(-dssim_weight * inverse), two(2.f), zero(0.f);
   parallel_for(threads, bands, [&](int band) {
     Blur<3> blur{window, memory + band * per_band, row, height};
-    float* scratch = memory + band * per_band + Blur<5>::floats(row);
+    float* scratch = memory + band * per_band + Blur<4>::floats(row);
     float *a = scratch, *b = scratch + n, *distance = scratch + 2 * n, *out = scratch + 3 * n;
     const auto fill = [&](int y, float* const* rows) {  // beyond the row's end the padding must stay zero
       for (int m = 0; m < 3; m++) memcpy(rows[m], derivatives + m * plane + static_cast<size_t>(y) * n, bytes);

@@ -57,6 +57,16 @@ class MouthVolume(TensorRecord):
         radial, axial = self._excess(points)
         return radial.clamp_min(0).square() + axial.clamp_min(0).square()
 
+    def penalty_with_gradient(
+        self, points: Float[Tensor, "n 3"]
+    ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
+        """Penalty of each point, m², and its derivative by the point's position, m."""
+        x, y, z = (points - self.centre).T.contiguous()
+        distance = (x * x + z * z).clamp_min(1e-24).sqrt()
+        radial, axial = (distance - self.radius).clamp_min(0), (y.abs() - self.half_height).clamp_min(0)
+        outward = 2 * radial / distance
+        return radial * radial + axial * axial, torch.stack([outward * x, 2 * axial * y.sign(), outward * z], -1)
+
     def _excess(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
         apart = points - self.centre
         # The floor keeps the root's gradient finite on the axis, where the penalty is zero anyway.

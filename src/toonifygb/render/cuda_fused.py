@@ -70,17 +70,17 @@ class CudaKernels(ReferenceKernels):
         eps: float = EPS,
     ) -> None:
         """See ``Kernels.adam_step``."""
-        psi = torch.ones(1, device=parameters.device)
+        psi = torch.ones(1, 1, device=parameters.device)
         state = (parameters[None], first_moment[None], second_moment[None])
-        self.blend_adam_step(*state, psi, gradient, learning_rates, step, factor=factor, eps=eps)
+        self.blend_adam_step(*state, psi, gradient[None], learning_rates, step, factor=factor, eps=eps)
 
     def blend_adam_step(
         self,
         deltas: Float[Tensor, "k p"],
         first_moment: Float[Tensor, "k p"],
         second_moment: Float[Tensor, "k p"],
-        psi: Float[Tensor, " k"],
-        gradient: Float[Tensor, " p"],
+        psi: Float[Tensor, "b k"],
+        gradient: Float[Tensor, "b p"],
         learning_rates: Float[Tensor, " p"],
         step: int,
         *,
@@ -92,9 +92,11 @@ class CudaKernels(ReferenceKernels):
     ) -> None:
         """See ``Kernels.blend_adam_step``."""
         check_blend_step(deltas, scale, widths)
-        k, p = deltas.shape
+        (k, p), frames = deltas.shape, len(psi)
         state = {"deltas": deltas, "first_moment": first_moment, "second_moment": second_moment}
-        self._check(p, k, **state, psi=psi, gradient=gradient, learning_rates=learning_rates)
+        self._check(p, k, **state, learning_rates=learning_rates)
+        for name, tensor, shape in (("psi", psi, (frames, k)), ("gradient", gradient, (frames, p))):
+            self._check_one(name, tensor, shape)
         n, groups = (p, (1,)) if scale is None else (scale.shape[1], tuple(widths))
         start = 0
         for width in groups:
@@ -110,6 +112,7 @@ class CudaKernels(ReferenceKernels):
                     start,
                     count,
                     n,
+                    k,
                     width,
                     factor,
                     eps,
@@ -119,6 +122,7 @@ class CudaKernels(ReferenceKernels):
                     BETA2=BETA2,
                     SCALED=scale is not None,
                     SKIP=skip_inactive,
+                    FRAMES=frames,
                     BLOCK=BLOCK,
                 )
             start += count
@@ -214,11 +218,12 @@ class CudaKernels(ReferenceKernels):
             ValueError: one has another shape, dtype, device or memory layout.
         """
         for name, tensor in tensors.items():
-            shape = {"psi": (k,), "base": (p,), "out": (p,), "gradient": (p,), "learning_rates": (p,)}.get(
-                name, (k, p)
-            )
-            dtypes = (torch.float32, torch.bfloat16) if name == "deltas" else (torch.float32,)
-            usable = tensor.dtype in dtypes and tensor.device.type == self.device.type and tensor.is_contiguous()
-            if not usable or tuple(tensor.shape) != shape:
-                found = f"{tensor.dtype} {tuple(tensor.shape)} on {tensor.device}"
-                raise ValueError(f"{name} is {found}, expected contiguous {dtypes[0]} {shape} on {self.device}")
+            shape = {"psi": (k,), "base": (p,), "out": (p,), "learning_rates": (p,)}.get(name, (k, p))
+            self._check_one(name, tensor, shape)
+
+    def _check_one(self, name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
+        dtypes = (torch.float32, torch.bfloat16) if name == "deltas" else (torch.float32,)
+        usable = tensor.dtype in dtypes and tensor.device.type == self.device.type and tensor.is_contiguous()
+        if not usable or tuple(tensor.shape) != shape:
+            found = f"{tensor.dtype} {tuple(tensor.shape)} on {tensor.device}"
+            raise ValueError(f"{name} is {found}, expected contiguous {dtypes[0]} {shape} on {self.device}")

@@ -221,23 +221,25 @@ def blend(base, deltas, psi, out, k, p, BLOCK: tl.constexpr):
 @triton.jit
 def adam(
     parameters, first_moment, second_moment, psi, gradient, learning_rates, scale,
-    p, start, count, n, per_gaussian, factor, eps, first_gain, second_gain,
-    BETA1: tl.constexpr, BETA2: tl.constexpr, SCALED: tl.constexpr, SKIP: tl.constexpr, BLOCK: tl.constexpr,
+    p, start, count, n, rows, per_gaussian, factor, eps, first_gain, second_gain,
+    BETA1: tl.constexpr, BETA2: tl.constexpr, SCALED: tl.constexpr, SKIP: tl.constexpr, FRAMES: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Adam on columns ``start`` to ``start + count`` of each row with the gradient psi_k·g.
+    """Adam on columns ``start`` to ``start + count`` of each row with the gradient psi_k·g, summed over the frames.
 
     Args:
         parameters: rows of ``p`` floats, changed in place like both moments.
         first_moment: running mean of the gradient.
         second_moment: running mean of its square.
-        psi: one factor per row.
-        gradient: g, ``p`` floats.
+        psi: one factor per row, for each frame.
+        gradient: g of each frame, ``p`` floats.
         learning_rates: ``p`` floats.
         scale: rows of ``n`` factors of the step; where one is 0 nothing changes. Not read unless ``SCALED``.
         p: floats per row.
         start: first column.
         count: columns.
         n: Gaussians.
+        rows: number of rows.
         per_gaussian: floats of each Gaussian among the columns.
         factor: of all learning rates.
         eps: added to the root of the second moment.
@@ -246,21 +248,27 @@ def adam(
         BETA1: decay of the first moment; a constant, because 1 - BETA2 needs more digits than float32 has.
         BETA2: decay of the second moment.
         SCALED: whether there is a scale.
-        SKIP: leave rows with psi_k = 0 as they are.
+        SKIP: leave rows with psi_k = 0 in all frames as they are.
+        FRAMES: number of frames.
         BLOCK: columns at once.
     """
     k = tl.program_id(1).to(tl.int64)
-    weight = tl.load(psi + k)
     place = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = place < count
     if SKIP:
-        live = place < tl.where(weight != 0.0, count, 0)
+        active = tl.abs(tl.load(psi + k))
+        for frame in tl.static_range(1, FRAMES):
+            active += tl.abs(tl.load(psi + frame * rows + k))
+        live = place < tl.where(active != 0.0, count, 0)
     column = start + place
     rate = factor * tl.load(learning_rates + column, mask=live, other=0.0)
     if SCALED:
         rate *= tl.load(scale + k * n + place // per_gaussian, mask=live, other=0.0)
         live = live & (rate != 0.0)
-    g = weight * tl.load(gradient + column, mask=live, other=0.0)
+    g = tl.load(psi + k) * tl.load(gradient + column, mask=live, other=0.0)
+    for frame in tl.static_range(1, FRAMES):
+        weight = tl.load(psi + frame * rows + k)
+        g += weight * tl.load(gradient + frame * p + column, mask=live, other=0.0)
     cell = k * p + column
     first = BETA1 * tl.load(first_moment + cell, mask=live, other=0.0) + (1.0 - BETA1) * g
     second = BETA2 * tl.load(second_moment + cell, mask=live, other=0.0) + (1.0 - BETA2) * g * g

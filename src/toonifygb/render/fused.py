@@ -3,6 +3,7 @@
 Parameters live in one flat vector of p floats (everything of the neutral Gaussians, activations not yet applied);
 the deltas ΔB_k of the K expression blendshapes are a matrix of K such rows. One frame's gradient with respect to
 row k is ψ_k·g, g being the gradient of the blended vector, so a step needs g alone and never the K×p gradient.
+A step over several frames sums their ψ_k·g.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from toonifygb.structures import GaussianParams, Splats
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jaxtyping import Float
+    from jaxtyping import Float, UInt8
     from torch import Tensor
 
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
@@ -47,6 +48,18 @@ class Kernels(Protocol):
             deltas: float32, or bfloat16 to halve the memory traffic.
             psi: expression coefficients.
             out: where to put the result; may be ``base``.
+        """
+        ...
+
+    def add_blends(
+        self, out: Float[Tensor, "b q"], deltas: Float[Tensor, "k p"], psi: Float[Tensor, "b k"]
+    ) -> None:
+        """out_b += Σ_k ψ_bk ΔB_k for several frames at once: the deltas are read only once.
+
+        Args:
+            out: changed in place, its first p columns.
+            deltas: float32.
+            psi: expression coefficients of each frame.
         """
         ...
 
@@ -81,8 +94,8 @@ class Kernels(Protocol):
         deltas: Float[Tensor, "k p"],
         first_moment: Float[Tensor, "k p"],
         second_moment: Float[Tensor, "k p"],
-        psi: Float[Tensor, " k"],
-        gradient: Float[Tensor, " p"],
+        psi: Float[Tensor, "b k"],
+        gradient: Float[Tensor, "b p"],
         learning_rates: Float[Tensor, " p"],
         step: int,
         *,
@@ -92,7 +105,7 @@ class Kernels(Protocol):
         widths: Sequence[int] = (),
         skip_inactive: bool = False,
     ) -> None:
-        """One step of Adam on all deltas with the gradient ψ_k·g of row k.
+        """One step of Adam on all deltas with the gradient Σ_b ψ_bk·g_b of row k, over the frames b.
 
         ``scale`` is 3DGB's blendshape consistency. There the trained tensor is Δ̂_k and the delta applied is
         scale·Δ̂_k; here ``deltas`` are the applied ones. Adam does not feel a constant factor of its gradient (up to
@@ -100,10 +113,10 @@ class Kernels(Protocol):
 
         Args:
             deltas: ΔB_k, changed in place, like both moments.
-            first_moment: running mean of ψ_k·g.
+            first_moment: running mean of Σ_b ψ_bk·g_b.
             second_moment: running mean of its square.
-            psi: expression coefficients of the frame.
-            gradient: g, with respect to the blended parameters.
+            psi: expression coefficients of each frame.
+            gradient: g of each frame, with respect to the blended parameters.
             learning_rates: per parameter.
             step: number of this step, from 1.
             factor: of all learning rates.
@@ -111,7 +124,8 @@ class Kernels(Protocol):
             scale: factor of the step per row and Gaussian; where it is 0 the delta stays as it is, and its moments
                 mean nothing.
             widths: floats per Gaussian of each parameter group in the flat vector, in order; needed with ``scale``.
-            skip_inactive: leave rows with ψ_k = 0 as they are, moments included, instead of coasting on momentum.
+            skip_inactive: leave rows with ψ_k = 0 in all frames as they are, moments included, instead of coasting
+                on momentum.
         """
         ...
 
@@ -143,6 +157,16 @@ class Kernels(Protocol):
         """
         ...
 
+    def place(
+        self,
+        frame: UInt8[Tensor, "y x 3"],
+        matte: Float[Tensor, "y x"],
+        background: Float[Tensor, " 3"],
+        factor: int = 1,
+    ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
+        """See ``place``."""
+        ...
+
     def l1_dssim(
         self,
         image: Float[Tensor, "h w 3"],
@@ -152,6 +176,28 @@ class Kernels(Protocol):
     ) -> tuple[Float[Tensor, ""], Float[Tensor, "h w 3"]]:
         """l1_weight·mean|image − target| + dssim_weight·(1 − SSIM), and its gradient with respect to ``image``."""
         ...
+
+
+def place(
+    frame: UInt8[Tensor, "y x 3"], matte: Float[Tensor, "y x"], background: Float[Tensor, " 3"], factor: int = 1
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
+    """The picture that a rendering is compared with: a frame cut out by its matte, on a background.
+
+    Args:
+        frame: sRGB bytes.
+        matte: share of each pixel that belongs to the head, 0..1.
+        background: RGB 0..1.
+        factor: the result is smaller by this whole number, which divides both sides; pixels are averaged.
+
+    Returns:
+        Colours and matte, 0..1.
+    """
+    color = torch.lerp(background.expand(*matte.shape, 3), frame.to(matte.dtype) / 255, matte[..., None])
+    if factor == 1:
+        return color, matte
+    height, width = (side // factor for side in matte.shape)
+    squares = (height, factor, width, factor)
+    return color.view(*squares, 3).mean((1, 3)), matte.reshape(squares).mean((1, 3))
 
 
 def learning_rates(widths: Sequence[int], rates: Sequence[float | Sequence[float]], n: int) -> Float[Tensor, " p"]:
@@ -214,6 +260,12 @@ class ReferenceKernels:
         blended = base + psi[active] @ deltas[active].to(base.dtype)
         return blended if out is None else out.copy_(blended)
 
+    def add_blends(
+        self, out: Float[Tensor, "b q"], deltas: Float[Tensor, "k p"], psi: Float[Tensor, "b k"]
+    ) -> None:
+        """See ``Kernels.add_blends``."""
+        out[:, : deltas.shape[1]].addmm_(psi, deltas)
+
     def adam_step(
         self,
         parameters: Float[Tensor, " p"],
@@ -237,8 +289,8 @@ class ReferenceKernels:
         deltas: Float[Tensor, "k p"],
         first_moment: Float[Tensor, "k p"],
         second_moment: Float[Tensor, "k p"],
-        psi: Float[Tensor, " k"],
-        gradient: Float[Tensor, " p"],
+        psi: Float[Tensor, "b k"],
+        gradient: Float[Tensor, "b p"],
         learning_rates: Float[Tensor, " p"],
         step: int,
         *,
@@ -251,7 +303,7 @@ class ReferenceKernels:
         """See ``Kernels.blend_adam_step``."""
         check_blend_step(deltas, scale, widths)
         for k in range(len(deltas)):
-            if skip_inactive and psi[k] == 0:
+            if skip_inactive and not psi[:, k].any():
                 continue
             if scale is None:
                 live, rates = torch.ones_like(learning_rates, dtype=torch.bool), learning_rates
@@ -259,7 +311,8 @@ class ReferenceKernels:
                 rates = learning_rates * expand_scale(scale[k : k + 1], widths)[0]
                 live = rates != 0
             delta, first, second = deltas[k][live], first_moment[k][live], second_moment[k][live]
-            self.adam_step(delta, first, second, psi[k] * gradient[live], rates[live], step, factor=factor, eps=eps)
+            slope = psi[:, k] @ gradient[:, live]
+            self.adam_step(delta, first, second, slope, rates[live], step, factor=factor, eps=eps)
             deltas[k, live], first_moment[k, live], second_moment[k, live] = delta, first, second
 
     def skin(
@@ -295,6 +348,16 @@ class ReferenceKernels:
             upstream = [gradient.means, gradient.quats, gradient.scales, gradient.opacities]
             found = torch.autograd.grad(outputs, inputs, upstream)
         return GaussianParams(*found, sh=gradient.sh)
+
+    def place(
+        self,
+        frame: UInt8[Tensor, "y x 3"],
+        matte: Float[Tensor, "y x"],
+        background: Float[Tensor, " 3"],
+        factor: int = 1,
+    ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
+        """See ``place``."""
+        return place(frame, matte, background, factor)
 
     def l1_dssim(
         self,

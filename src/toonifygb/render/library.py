@@ -93,7 +93,17 @@ class BlendState(Structure):
         *((name, c_void_p) for name in ("deltas", "first_moment", "second_moment")),
         *((name, c_void_p) for name in ("psi", "gradient", "learning_rates", "scale", "widths")),
         ("p", c_int64),
-        *((name, c_int32) for name in ("k", "n", "groups", "skip_inactive")),
+        *((name, c_int32) for name in ("k", "n", "groups", "skip_inactive", "frames")),
+    ]
+
+
+class Picture(Structure):
+    """Mirrors ``tgb::Picture``."""
+
+    _fields_ = [
+        *((name, c_void_p) for name in ("frame", "matte", "background")),
+        ("height", c_int32),
+        ("width", c_int32),
     ]
 
 
@@ -127,10 +137,12 @@ _SIGNATURES = {
     "tgb_raster_counts": (None, [c_void_p, POINTER(c_int32)]),
     "tgb_measure_flops": (c_double, []),
     "tgb_blend": (None, [c_void_p, c_void_p, c_int32, c_void_p, c_int32, c_int64, c_void_p, c_int32]),
+    "tgb_add_blends": (None, [c_void_p, c_void_p, c_int32, c_int32, c_int64, c_void_p, c_int64, c_int32]),
     "tgb_adam": (None, [*[c_void_p] * 5, c_int64, POINTER(AdamRates), c_int32]),
     "tgb_blend_adam": (None, [POINTER(BlendState), POINTER(AdamRates), c_int32]),
     "tgb_skin": (None, [POINTER(Skin), POINTER(SkinOutput), c_int32]),
     "tgb_skin_backward": (None, [POINTER(Skin), POINTER(SkinOutput), POINTER(SkinGradient), c_int32]),
+    "tgb_place": (c_int32, [POINTER(Picture), c_int32, c_void_p, c_void_p, c_int32]),
     "tgb_l1_dssim": (c_double, [c_void_p, c_void_p, c_int32, c_int32, c_float, c_float, c_void_p, c_int32]),
 }
 

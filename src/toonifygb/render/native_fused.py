@@ -15,7 +15,7 @@ from toonifygb.structures import GaussianParams, Splats
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jaxtyping import Float
+    from jaxtyping import Float, UInt8
     from torch import Tensor
 
 
@@ -102,6 +102,24 @@ class NativeKernels:
         )
         return out
 
+    def add_blends(
+        self, out: Float[Tensor, "b q"], deltas: Float[Tensor, "k p"], psi: Float[Tensor, "b k"]
+    ) -> None:
+        """See ``Kernels.add_blends``."""
+        (k, p), (frames, q) = deltas.shape, out.shape
+        if p > q:
+            raise ValueError(f"out has {q} columns, expected the {p} of deltas or more")
+        self._engine.tgb_add_blends(
+            _address(deltas, "deltas", (k, p)),
+            _address(psi, "psi", (frames, k)),
+            frames,
+            k,
+            p,
+            _address(out, "out", (frames, q)),
+            q,
+            self.threads,
+        )
+
     def adam_step(
         self,
         parameters: Float[Tensor, " p"],
@@ -132,8 +150,8 @@ class NativeKernels:
         deltas: Float[Tensor, "k p"],
         first_moment: Float[Tensor, "k p"],
         second_moment: Float[Tensor, "k p"],
-        psi: Float[Tensor, " k"],
-        gradient: Float[Tensor, " p"],
+        psi: Float[Tensor, "b k"],
+        gradient: Float[Tensor, "b p"],
         learning_rates: Float[Tensor, " p"],
         step: int,
         *,
@@ -145,7 +163,7 @@ class NativeKernels:
     ) -> None:
         """See ``Kernels.blend_adam_step``."""
         check_blend_step(deltas, scale, widths)
-        k, p = deltas.shape
+        (k, p), frames = deltas.shape, len(psi)
         n = p if scale is None else scale.shape[1]
         groups = (1,) if scale is None else tuple(widths)
         group_widths = (c_int32 * len(groups))(*groups)
@@ -153,8 +171,8 @@ class NativeKernels:
             deltas=_address(deltas, "deltas", (k, p)),
             first_moment=_address(first_moment, "first_moment", (k, p)),
             second_moment=_address(second_moment, "second_moment", (k, p)),
-            psi=_address(psi, "psi", (k,)),
-            gradient=_address(gradient, "gradient", (p,)),
+            psi=_address(psi, "psi", (frames, k)),
+            gradient=_address(gradient, "gradient", (frames, p)),
             learning_rates=_address(learning_rates, "learning_rates", (p,)),
             scale=None if scale is None else _address(scale, "scale", (k, n)),
             widths=addressof(group_widths),
@@ -163,6 +181,7 @@ class NativeKernels:
             n=n,
             groups=len(groups),
             skip_inactive=skip_inactive,
+            frames=frames,
         )
         self._engine.tgb_blend_adam(state, _rates(step, factor, eps), self.threads)
 
@@ -205,6 +224,28 @@ class NativeKernels:
             self.threads,
         )
         return found
+
+    def place(
+        self,
+        frame: UInt8[Tensor, "y x 3"],
+        matte: Float[Tensor, "y x"],
+        background: Float[Tensor, " 3"],
+        factor: int = 1,
+    ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
+        """See ``Kernels.place``."""
+        height, width = matte.shape
+        picture = library.Picture(
+            frame=_address(frame, "frame", (height, width, 3), torch.uint8),
+            matte=_address(matte, "matte", (height, width)),
+            background=_address(background, "background", (3,)),
+            height=height,
+            width=width,
+        )
+        small = torch.empty(height // factor, width // factor)
+        color = torch.empty(*small.shape, 3)
+        if not self._engine.tgb_place(picture, factor, color.data_ptr(), small.data_ptr(), self.threads):
+            raise MemoryError("the engine ran out of memory for a picture")
+        return color, small
 
     def l1_dssim(
         self,

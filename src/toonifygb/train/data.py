@@ -22,6 +22,7 @@ from toonifygb.atomic import replacing
 from toonifygb.errors import InputError
 from toonifygb.geometry.cameras import crop_camera, project
 from toonifygb.progress import SILENT
+from toonifygb.render.fused import place
 from toonifygb.structures import Camera, Split
 
 if TYPE_CHECKING:
@@ -95,21 +96,22 @@ class Dataset:
     def target(
         self, index: int, device: torch.device | str = "cpu"
     ) -> tuple[Float[Tensor, "s s 3"], Float[Tensor, "s s"]]:
-        """What a render of this frame should be: colour × matte on black, 0..1, and the matte.
+        """What a render of this frame should be: colour × matte on black, 0..1, and the matte."""
+        frame, matte = self.pixels(index, device)
+        return place(frame, matte, matte.new_zeros(3), self.reduction)
+
+    def pixels(
+        self, index: int, device: torch.device | str = "cpu"
+    ) -> tuple[UInt8[Tensor, "y y 3"], Float[Tensor, "y y"]]:
+        """The stored crop of a frame, and its matte 0..1 that ends with the neck; not reduced.
 
         Bytes travel to the device, a quarter of what the floats would be.
         """
-        home = device if self.reduction == 1 else "cpu"
-        matte = torch.tensor(self.mattes[index]).to(home).float().div_(255)
+        matte = torch.tensor(self.mattes[index]).to(device).float().div_(255)
         if self.cuts is not None:
             first, kept = self.cuts.rows(index, *matte.shape)
-            matte[first:] *= kept.to(home)
-        color = torch.tensor(self.frames[index]).to(home).float().div_(255).mul_(matte[..., None])
-        if self.reduction == 1:
-            return color, matte
-        small = (self.size, self.size)
-        pooled = (cv2.resize(image.numpy(), small, interpolation=cv2.INTER_AREA) for image in (color, matte))
-        return torch.from_numpy(next(pooled)).to(device), torch.from_numpy(next(pooled)).to(device)
+            matte[first:] *= kept.to(device)
+        return torch.tensor(self.frames[index]).to(device), matte
 
 
 def build_dataset(

@@ -123,6 +123,7 @@ def _step(stepper: Stepper, densifier: Densifier | None) -> LossTerms:
     terms = stepper.step(info)
     densifier.observe(stepper.state, info)
     if densifier.due(stepper.state.step):
+        stepper.finish()
         densifier.apply(stepper.state)
         stepper.rebind()
     return terms

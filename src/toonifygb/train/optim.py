@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from toonifygb.avatar.bases import Mixer
-from toonifygb.avatar.fields import FIELDS, each, rows, width
+from toonifygb.avatar.fields import FIELDS, cut, each, rows, width
 from toonifygb.structures import GaussianParams
+from toonifygb.train.state import Seen
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -68,6 +69,8 @@ LEARNED = ("hidden", "bias", "out")
 scores the same on a clip, but eyes that were seldom closed there no longer close when they are told to."""
 MIXER_RATE, MIXER_EPS = 1e-3, 1e-8
 """Adam's rate and ε for them."""
+RATE_GROWTH = 0.5
+"""A step of the deltas over B frames takes B to this power of the rate for one."""
 SETTLE_FROM, SETTLE_TO = 0.6, 0.1
 """From this share of the steps on all rates fall, log-linear, to this share of themselves: it quiets the noise of
 single-image steps."""
@@ -97,18 +100,57 @@ def blend(state: TrainState, psi: Coefficients, kernels: Kernels) -> GaussianPar
     return GaussianParams(**blended)
 
 
+def changes(state: TrainState, psi: list[Coefficients], kernels: Kernels, out: GaussianParams) -> None:
+    """Σ ψk ΔBk of several frames for the Gaussians of the face; all deltas are read only once.
+
+    Args:
+        state: holds the deltas.
+        psi: coefficients of each frame.
+        kernels: where it runs.
+        out: gets the sums, one set per frame; see ``no_changes``.
+    """
+    for name, sums in each(out):
+        flat = rows(sums).zero_()
+        for trained, coefficients in (
+            (state.driver, [frame.driver for frame in psi]),
+            (state.expression, [frame.expression for frame in psi]),
+        ):
+            deltas = rows(getattr(trained.values, name))
+            if len(deltas):
+                kernels.add_blends(flat[: len(psi)], deltas, torch.stack(coefficients))
+
+
+def no_changes(state: TrainState, frames: int) -> GaussianParams:
+    """Room for ``changes``, kept from step to step: new memory would cost more than the sums."""
+    face = cut(state.neutral.values, 0, state.counts.face)
+    return face.map(lambda tensor: tensor.new_zeros(frames, *tensor.shape))
+
+
+def changed(neutral: GaussianParams, by: GaussianParams, kernels: Kernels) -> GaussianParams:
+    """The neutral Gaussians, the first of them changed."""
+    values = {}
+    for name, base in each(neutral):
+        offset = getattr(by, name).reshape(1, -1)
+        values[name] = torch.empty_like(base)
+        flat, from_, p = values[name].view(-1), base.view(-1), offset.shape[1]
+        kernels.blend(from_[:p], offset, offset.new_ones(1), out=flat[:p])
+        flat[p:] = from_[p:]
+    return GaussianParams(**values)
+
+
 class Optimizer:
     """Adam over all parameters of a ``TrainState``; holds rates, no state of its own.
 
     Args:
         state: whose sizes the rates are laid out for.
         steps: length of the whole training.
+        frames: steps, one frame each, to every step of the deltas.
         kernels: where the fused updates run.
     """
 
-    def __init__(self, state: TrainState, steps: int, kernels: Kernels) -> None:
+    def __init__(self, state: TrainState, steps: int, frames: int, kernels: Kernels) -> None:
         self._kernels = kernels
-        self._steps = steps
+        self._steps, self._frames = steps, frames
         stretch = max(1.0, FULL_STEPS / steps)
         delta = DELTA_RATES | {name: DELTA_RATES[name] * stretch for name in ("means", "opacity_logits")}
         self._neutral = _rates(state.neutral.values, NEUTRAL_RATES)
@@ -130,44 +172,56 @@ class Optimizer:
         """
         settle = settling(state.step / self._steps)
         means = means_decay(state.step / self._steps)
-        own_eps = DELTA_EPS if state.mixer is None else BASIS_EPS
         if state.mixer is not None:
             self._mixer_step(state, gradient, psi, settle)
         for name, g in each(gradient):
             factor = means if name == "means" else settle
             values, first, second = _parts(state.neutral, name)
-            flat = g.reshape(-1)
             self._kernels.adam_step(
                 values.view(-1),
                 first.view(-1),
                 second.view(-1),
-                flat,
+                g.reshape(-1),
                 self._neutral[name],
                 state.step,
                 factor=factor,
             )
-            for trained, rates, coefficients, scale, eps in (
-                (state.expression, self._expression, psi.expression, state.scale, own_eps),
-                (state.driver, self._driver, psi.driver, None, DELTA_EPS),
-            ):
-                values, first, second = _parts(trained, name)
+        state.seen.append(Seen(psi.expression, psi.driver, cut(gradient, 0, state.counts.face)))
+        if len(state.seen) == self._frames or state.step == self._steps:
+            self.finish(state)
+
+    def finish(self, state: TrainState) -> None:
+        """One Adam step of the deltas with what the frames seen since the last one say."""
+        if not state.seen:
+            return
+        settle = settling(state.step / self._steps)
+        step = -(-state.step // self._frames)
+        own_eps = DELTA_EPS if state.mixer is None else BASIS_EPS
+        for trained, rates, coefficients, scale, eps in (
+            (state.expression, self._expression, [seen.expression for seen in state.seen], state.scale, own_eps),
+            (state.driver, self._driver, [seen.driver for seen in state.seen], None, DELTA_EPS),
+        ):
+            psi = torch.stack(coefficients)
+            for name in FIELDS:
+                values, first, second = (rows(part) for part in _parts(trained, name))
                 if not len(values):
                     continue
-                p = rows(values).shape[1]
+                gradients = [getattr(seen.gradient, name).reshape(-1)[: values.shape[1]] for seen in state.seen]
                 self._kernels.blend_adam_step(
-                    rows(values),
-                    rows(first),
-                    rows(second),
-                    coefficients,
-                    flat[:p],
+                    values,
+                    first,
+                    second,
+                    psi,
+                    gradients[0][None] if len(gradients) == 1 else torch.stack(gradients),
                     rates[name],
-                    state.step,
-                    factor=settle,
+                    step,
+                    factor=settle * self._frames**RATE_GROWTH,
                     eps=eps,
                     scale=scale,
                     widths=(width(name, state.neutral.values.sh.shape[1]),),
                     skip_inactive=True,
                 )
+        state.seen.clear()
 
     def _mixer_step(self, state: TrainState, gradient: GaussianParams, psi: Coefficients, settle: float) -> None:
         """Adam on the network that weighs the bases; the derivative by a basis' weight is its product with g."""

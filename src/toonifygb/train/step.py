@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 import torch
 
 from toonifygb.avatar import MouthVolume
-from toonifygb.avatar.fields import cut, join
+from toonifygb.avatar.fields import join
 from toonifygb.avatar.skinning import pose_offsets
 from toonifygb.render import RenderInfo
 from toonifygb.structures import GaussianParams, Rendering, Splats
-from toonifygb.train.losses import LossTerms, LossWeights, image_gradients, mouth_loss, placed_on
-from toonifygb.train.optim import Coefficients, Optimizer, blend
+from toonifygb.train.losses import LossTerms, LossWeights, image_gradients, mouth_gradients
+from toonifygb.train.optim import Coefficients, Optimizer, blend, changed, changes, no_changes
 from toonifygb.train.state import Counts
 
 if TYPE_CHECKING:
@@ -104,10 +104,19 @@ class Stepper:
         self._transforms = template.transforms(sequence.motion).to(device)
         self._features = template.pose_feature(sequence.motion).to(device)
         self._psi = template.signals(sequence.motion).to(device)
+        self._changed_in: list[int] = []
 
     def rebind(self) -> None:
         """Prepares again what depends on the set of Gaussians; after densification."""
-        self._optimizer = Optimizer(self.state, self._config.steps, self._kernels)
+        frames = self._config.delta_frames
+        self._optimizer = Optimizer(self.state, self._config.steps, frames, self._kernels)
+        self._changes = no_changes(self.state, frames)
+        self._changed_in = []
+
+    def finish(self) -> None:
+        """Gives the deltas what the last frames say of them, before the set of Gaussians changes."""
+        self._optimizer.finish(self.state)
+        self._changed_in = []
 
     @property
     def sh_degree(self) -> int:
@@ -122,6 +131,8 @@ class Stepper:
         state.step += 1
         gradient, terms = self._gradient(index, background, info)
         self._optimizer.step(state, gradient, self._frame(index).psi)
+        if not state.seen:
+            self._changed_in = []
         return terms
 
     def splats(self, index: int) -> Splats:
@@ -132,35 +143,47 @@ class Stepper:
         """The same for any motion, no batch axis."""
         return self._posed(self._motion(motion))[1].to("cpu")
 
-    def pull(
-        self,
-        index: int,
-        errors: ImageErrors,
-        info: RenderInfo | None = None,
-        background: Float[Tensor, " 3"] | None = None,
-    ) -> Pull:
-        """How errors of one frame's picture pull at the Gaussians.
+    def pull(self, index: int, errors: ImageErrors) -> Pull:
+        """How errors of one frame's picture, on black, pull at the Gaussians.
 
         Args:
             index: frame number.
             errors: the rendering, colours and matte of the frame → derivatives of some loss by the rendering's
                 colour and opacity.
-            info: filled with the densification statistic when given.
-            background: what is rendered behind the Gaussians; black when ``None``.
         """
+        black = torch.zeros(3, device=self._kernels.device)
+        blended = blend(self.state, self._frame(index).psi, self._kernels)
+        return self._pull(self._dataset, index, blended, errors, black, None)
+
+    def _pull(
+        self,
+        dataset: Dataset,
+        index: int,
+        blended: GaussianParams,
+        errors: ImageErrors,
+        background: Float[Tensor, " 3"],
+        info: RenderInfo | None,
+    ) -> Pull:
         frame = self._frame(index)
-        raw, splats = self._posed(frame)
+        raw, splats = self._skinned(frame, blended)
         leaves = _leaves(splats)
         cut_off = Splats(*leaves, sh_frames=splats.sh_frames)
-        camera = self._dataset.camera(index)
+        camera = dataset.camera(index)
+        pixels = dataset.pixels(index, self._kernels.device)
+        target = self._kernels.place(*pixels, background, dataset.reduction)
         rendering = self._renderer.render(
             cut_off, camera, background=background, sh_degree=self.sh_degree, info=info
         )
-        slopes = errors(rendering, *self._dataset.target(index, self._kernels.device))
+        slopes = errors(rendering, *target)
         world = Splats(*torch.autograd.grad([rendering.color, rendering.alpha], leaves, slopes))
         return Pull(
             splats, world, self._kernels.skin_gradient(raw, self.state.skin_weights, frame.transforms, world)
         )
+
+    def _looked_at(self) -> Dataset:
+        """The training set, at half its resolution in the first steps."""
+        coarse = self.state.step <= self._config.coarse_share * self._config.steps
+        return self._dataset.reduced(2) if coarse else self._dataset
 
     def _frame(self, index: int) -> _Frame:
         return _Frame(self._coefficients(self._psi[index]), self._features[index], self._transforms[index])
@@ -179,7 +202,26 @@ class Stepper:
 
     def _posed(self, frame: _Frame) -> tuple[GaussianParams, Splats]:
         """Blended raw parameters of one frame, and the splats they become."""
-        raw = blend(self.state, frame.psi, self._kernels)
+        return self._skinned(frame, blend(self.state, frame.psi, self._kernels))
+
+    def _blended(self, index: int) -> GaussianParams:
+        """Blended raw parameters of a frame; those of the next frames are made ready with it.
+
+        The deltas stay as they are until the optimizer has seen all frames of its next step.
+        """
+        state = self.state
+        if index not in self._changed_in:
+            left = self._config.delta_frames - len(state.seen) if state.mixer is None else 1
+            soon = state.order[state.position : state.position + left - 1].tolist()
+            self._changed_in = [index, *soon]
+            coefficients = [self._frame(each_index).psi for each_index in self._changed_in]
+            changes(state, coefficients, self._kernels, self._changes)
+        place = self._changed_in.index(index)
+        by = self._changes.map(lambda tensor: tensor[place])
+        return changed(state.neutral.values, by, self._kernels)
+
+    def _skinned(self, frame: _Frame, raw: GaussianParams) -> tuple[GaussianParams, Splats]:
+        """Splats of blended raw parameters, which get the corrections for the pose."""
         raw.means[: self.state.counts.face].add_(pose_offsets(frame.features, self.state.pose_basis))
         return raw, self._kernels.skin(raw, self.state.skin_weights, frame.transforms)
 
@@ -190,25 +232,23 @@ class Stepper:
         terms = LossTerms(0.0, 0.0, 0.0)
 
         def errors(rendering: Rendering, target: Tensor, matte: Tensor) -> tuple[Tensor, Tensor]:
-            target = placed_on(background, target, matte)
             terms.photo, terms.alpha, v_color, v_alpha = image_gradients(
                 rendering, target, matte, self._weights, self._kernels
             )
             return v_color, v_alpha
 
-        gradient = self.pull(index, errors, info, background).raw
+        gradient = self._pull(self._looked_at(), index, self._blended(index), errors, background, info).raw
         terms.mouth = self._add_mouth_gradient(gradient)
         return gradient, terms
 
     def _add_mouth_gradient(self, gradient: GaussianParams) -> float:
         """Adds the mouth penalty's gradient in place; returns the penalty."""
-        counts, means = self.state.counts, self.state.neutral.values.means
-        places = [(counts.face, counts.face + counts.upper), (counts.face + counts.upper, counts.all)]
-        upper, lower = (means[start:stop].detach().requires_grad_() for start, stop in places)
-        loss = mouth_loss(upper, lower, self._mouth, self._weights)
-        for (start, stop), found in zip(places, torch.autograd.grad(loss, [upper, lower]), strict=True):
-            cut(gradient, start, stop).means.add_(found)
-        return float(loss.detach())
+        counts, mouth = self.state.counts, slice(self.state.counts.face, None)
+        loss, slopes = mouth_gradients(
+            self.state.neutral.values.means[mouth], counts.upper, self._mouth, self._weights
+        )
+        gradient.means[mouth].add_(slopes)
+        return loss
 
 
 def _leaves(splats: Splats) -> list[torch.Tensor]:
