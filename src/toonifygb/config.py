@@ -242,7 +242,15 @@ WHOLE_PICTURE = 100.0
 """A ``crop_scale`` with which the largest square of the picture is taken, whatever the face's size."""
 DRAFT = TrainConfig()
 STANDARD = TrainConfig(n_gaussians=32_000, n_mouth_gaussians=4_000, resolution=512, steps=6_000)
-PAPER = TrainConfig(n_gaussians=50_000, n_mouth_gaussians=14_000, resolution=512, steps=40_000, sh_degree=3)
+PAPER = TrainConfig(
+    n_gaussians=50_000,
+    n_mouth_gaussians=14_000,
+    resolution=512,
+    steps=40_000,
+    sh_degree=3,
+    delta_frames=8,
+    coarse_share=0.5,
+)
 PRESETS: dict[Quality, TrainConfig] = {"draft": DRAFT, "standard": STANDARD, "paper": PAPER}
 
 

@@ -32,7 +32,6 @@ from toonifygb.train.optim import (
     MIXER_EPS,
     MIXER_RATE,
     NEUTRAL_RATES,
-    RATE_GROWTH,
     means_decay,
     mixer_gradient,
     settling,
@@ -94,7 +93,6 @@ class PlainTraining:
             for rows in self.parts
         ]
         self.groups, self.delta_groups = [], []
-        growth = delta_frames**RATE_GROWTH
         for name in FIELDS:
             key = "sh_dc" if name == "sh" else name
             faster = FULL_STEPS / TINY.steps if name in {"means", "opacity_logits"} else 1
@@ -105,7 +103,7 @@ class PlainTraining:
                 (own, rate, own_eps),
                 (driver, DRIVER_TRAVEL[key] / TINY.steps, DELTA_EPS),
             ):
-                self.delta_groups.append({"params": [tensor], "lr": growth * lr, "settles": True, "eps": eps})
+                self.delta_groups.append({"params": [tensor], "lr": delta_frames * lr, "settles": True, "eps": eps})
         self.mixer = None if template.mixer is None else template.mixer.map(lambda t: t.clone().requires_grad_())
         if self.mixer is not None:
             self.add([getattr(self.mixer, name) for name in LEARNED], MIXER_RATE, True, MIXER_EPS)

@@ -8,7 +8,7 @@ namespace TGB_ISA {
 namespace {
 
 constexpr int kSweep = 4096;    // parameters per blending task: they stay in the L1 cache while rows stream past
-constexpr int kFrameSweep = 2048;  // the same where several frames' sums share the cache
+constexpr int kFrameSweep = 1024;  // the same where several frames' sums share the cache
 constexpr int kLiveBlock = 64;    // Gaussians that are left out together where a row moves none of them
 constexpr int kAdamChunk = 8192;  // parameters per Adam task: gradient and rates stay in the L2 cache
 
@@ -108,14 +108,31 @@ inline void adam_range(const AdamFactors& f, float weight, const float* g, const
   }
 }
 
-// Learning rates of row k for Gaussians [g0, g1) of a group; returns whether any is not zero.
-inline bool scaled_rates(const float* rates, const float* scale, int width, int g0, int g1, float* out) {
+inline bool any_live(const float* scale, int g0, int g1) {
   bool live = false;
   for (int g = g0; g < g1; g++) live |= scale[g] != 0;
-  if (!live) return false;
-  for (int g = g0; g < g1; g++)
-    for (int j = 0; j < width; j++) *out++ = scale[g] * *rates++;
-  return true;
+  return live;
+}
+
+// out = the learning rates of n Gaussians, Width each, times their scales.
+template <int Width>
+inline void scaled_rates(const float* rates, const float* scale, int n, float* out) {
+  for (int g = 0; g < n; g++)
+    for (int j = 0; j < Width; j++) out[g * Width + j] = scale[g] * rates[g * Width + j];
+}
+
+inline void scaled_rates(const float* rates, const float* scale, int n, int width, float* out) {
+  switch (width) {  // known widths become vector code
+    case 1: return scaled_rates<1>(rates, scale, n, out);
+    case 3: return scaled_rates<3>(rates, scale, n, out);
+    case 4: return scaled_rates<4>(rates, scale, n, out);
+    case 12: return scaled_rates<12>(rates, scale, n, out);
+    case 27: return scaled_rates<27>(rates, scale, n, out);
+    case 48: return scaled_rates<48>(rates, scale, n, out);
+    default:
+      for (int g = 0; g < n; g++)
+        for (int j = 0; j < width; j++) *out++ = scale[g] * *rates++;
+  }
 }
 
 // Whether any frame of the step shows row k.
@@ -151,12 +168,21 @@ inline void adam_row(const BlendState& s, const AdamFactors& f, int k, int64_t b
   adam_range(f, weight, gradient, rates, s.deltas + at, s.first_moment + at, s.second_moment + at, count);
 }
 
-// Row k of Gaussians [g0, g1), a part of a task, of a group; nothing where the row moves none of them.
+// Row k of Gaussians [g0, g1), a task of a group, without the blocks of which the row moves none.
 inline void scaled_adam(const BlendState& s, const AdamFactors& f, int64_t offset, int width, int k, int g0, int g1) {
   float rates[kAdamChunk];
-  const int64_t begin = offset + static_cast<int64_t>(g0) * width;
-  if (!scaled_rates(s.learning_rates + begin, s.scale + static_cast<int64_t>(k) * s.n, width, g0, g1, rates)) return;
-  adam_row(s, f, k, begin, (g1 - g0) * width, rates);
+  const float* scale = s.scale + static_cast<int64_t>(k) * s.n;
+  for (int g = g0; g < g1;) {
+    const int first = g;
+    while (g < g1 && any_live(scale, g, imin(g1, g + kLiveBlock))) g = imin(g1, g + kLiveBlock);
+    if (g == first) {
+      g = imin(g1, g + kLiveBlock);
+      continue;
+    }
+    const int64_t begin = offset + static_cast<int64_t>(first) * width;
+    scaled_rates(s.learning_rates + begin, scale + first, g - first, width, rates);
+    adam_row(s, f, k, begin, (g - first) * width, rates);
+  }
 }
 
 // Task `task` of group `width` wide, starting at parameter `offset`: some Gaussians, all rows.
@@ -168,8 +194,7 @@ void blend_adam_task(const BlendState& s, const AdamFactors& f, int64_t offset, 
     if (s.scale == nullptr)
       adam_row(s, f, k, begin, count, s.learning_rates + begin);
     else
-      for (int g = g0; g < g1; g += kLiveBlock)
-        scaled_adam(s, f, offset, width, k, g, imin(g1, g + kLiveBlock));
+      scaled_adam(s, f, offset, width, k, g0, g1);
   }
 }
 

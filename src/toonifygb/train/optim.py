@@ -69,8 +69,6 @@ LEARNED = ("hidden", "bias", "out")
 scores the same on a clip, but eyes that were seldom closed there no longer close when they are told to."""
 MIXER_RATE, MIXER_EPS = 1e-3, 1e-8
 """Adam's rate and ε for them."""
-RATE_GROWTH = 0.5
-"""A step of the deltas over B frames takes B to this power of the rate for one."""
 SETTLE_FROM, SETTLE_TO = 0.6, 0.1
 """From this share of the steps on all rates fall, log-linear, to this share of themselves: it quiets the noise of
 single-image steps."""
@@ -191,7 +189,12 @@ class Optimizer:
             self.finish(state)
 
     def finish(self, state: TrainState) -> None:
-        """One Adam step of the deltas with what the frames seen since the last one say."""
+        """One Adam step of the deltas with what the frames seen since the last one say.
+
+        It is as long as the steps that each of them alone would have been, together. wojtek_1 at 512 px, 1500
+        steps, held out: 32.61 dB / 0.942 frame by frame, 32.66 / 0.944 for 8 frames; with the root of their number,
+        as noise alone would ask for, 32.42 / 0.942.
+        """
         if not state.seen:
             return
         settle = settling(state.step / self._steps)
@@ -215,7 +218,7 @@ class Optimizer:
                     gradients[0][None] if len(gradients) == 1 else torch.stack(gradients),
                     rates[name],
                     step,
-                    factor=settle * self._frames**RATE_GROWTH,
+                    factor=settle * len(state.seen),
                     eps=eps,
                     scale=scale,
                     widths=(width(name, state.neutral.values.sh.shape[1]),),
