@@ -68,6 +68,6 @@ class Poser:
                 deltas = rows(getattr(group, name))
                 if deltas.numel():
                     base = values.view(-1)[: deltas.shape[1]]
-                    base.copy_(self._kernels.blend(base, deltas, psi))
+                    self._kernels.blend(base, deltas, psi, out=base)
             blended[name] = values
         return GaussianParams(**blended)

@@ -93,7 +93,7 @@ def blend(state: TrainState, psi: Coefficients, kernels: Kernels) -> GaussianPar
             deltas = rows(getattr(trained.values, name))
             if len(deltas):
                 base = values.view(-1)[: deltas.shape[1]]
-                base.copy_(kernels.blend(base, deltas, coefficients))
+                kernels.blend(base, deltas, coefficients, out=base)
         blended[name] = values
     return GaussianParams(**blended)
 
