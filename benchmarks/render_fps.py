@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from benchmarks import scenes
+from benchmarks.gpu import scene
 from benchmarks.harness import Figure, cpu_seconds, wall_seconds
 from toonifygb import head, render
-from toonifygb.avatar import Poser, init_avatar
-from toonifygb.config import DRAFT, STANDARD, TrainConfig
+from toonifygb.avatar import Avatar, Poser, init_avatar
+from toonifygb.config import DRAFT, PAPER, STANDARD, TrainConfig
 from toonifygb.geometry import cameras
 from toonifygb.render.native import available_threads
 from toonifygb.structures import Camera, HeadMotion
@@ -27,9 +30,8 @@ def _camera(size: int) -> Camera:
     return cameras.tracked_camera(float(scenes.camera(size).K[0, 0]), size, size)
 
 
-def _figures(name: str, config: TrainConfig) -> list[Figure]:
+def _figures(name: str, avatar: Avatar, config: TrainConfig) -> list[Figure]:
     model = head.load("open")
-    avatar = init_avatar(model, torch.zeros(model.shape_basis.shape[-1]), config)
     motion, camera = _motion(model.expression_basis.shape[-1]), _camera(config.resolution)
     threads, figures = available_threads(), []
     for count, clock, label in ((1, cpu_seconds, "1 thread"), (threads, wall_seconds, f"{threads} threads, wall")):
@@ -44,6 +46,14 @@ def _figures(name: str, config: TrainConfig) -> list[Figure]:
 
 
 def run() -> list[Figure]:
-    """Figures of an untrained avatar in the draft and the standard setting."""
+    """Figures of untrained avatars in the draft and the standard setting, and of a full one in the paper's."""
     torch.set_num_threads(1)
-    return _figures("draft avatar", DRAFT) + _figures("standard avatar", STANDARD)
+    model, figures = head.load("open"), []
+    for name, config in (("draft avatar", DRAFT), ("standard avatar", STANDARD)):
+        avatar = init_avatar(model, torch.zeros(model.shape_basis.shape[-1]), config)
+        figures += _figures(name, avatar, config)
+    for degree in (1, 3):
+        config = replace(PAPER, sh_degree=degree)
+        avatar = scene.avatar(config.n_gaussians, config.n_mouth_gaussians, degree, config.resolution)
+        figures += _figures(f"paper avatar, SH {degree}", avatar, config)
+    return figures

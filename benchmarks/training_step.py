@@ -1,8 +1,8 @@
 """A training step: its parts in the draft setting, and all of it, as training takes it, in the paper's.
 
 Draft: 15k Gaussians, 20 blendshapes, 256 px, SH degree 1. Paper: 64k Gaussians, all blendshapes of the open head,
-512 px; on it the step's floor is the memory traffic of blending and of Adam over the pairs (Gaussian, blendshape)
-that move, plus the arithmetic of compositing (``benchmarks.rasterizer`` has that one's floor).
+512 px; the floor beside it is the memory traffic of blending and of Adam over the pairs (Gaussian, blendshape) that
+move, shared by the frames of one step of them; compositing comes on top (``benchmarks.rasterizer`` has its floor).
 """
 
 from __future__ import annotations
@@ -30,23 +30,25 @@ ADAM_BYTES, BLEND_BYTES = 24, 4
 
 
 FRAMES = 16
-PAPER_STEP_MS = 1e3 * 44 * 60 / 40_000
-"""A step of the paper's 40 000 in 44 minutes on an RTX 4090, everything included."""
+PAPER_MINUTES = 44
+PAPER_STEP_MS = 1e3 * PAPER_MINUTES * 60 / 40_000
+"""The paper's 40 000 steps on an RTX 4090, everything included."""
 
 
 def run() -> list[Figure]:
     """Processor time of each part in the draft setting, and whole steps in the paper's."""
-    return parts() + [whole_step(degree) for degree in (1, 3)]
+    return parts() + [figure for degree in (1, 3) for figure in whole_steps(degree)]
 
 
-def whole_step(degree: int) -> Figure:
-    """Wall time of one step of the paper's regime on all cores, beside the paper's own."""
+def whole_steps(degree: int) -> list[Figure]:
+    """Wall time of the paper's steps on all cores, at half and at full resolution, and of all of them together."""
     config = dataclasses.replace(PAPER, sh_degree=degree)
     avatar = scene.avatar(config.n_gaussians, config.n_mouth_gaussians, degree, config.resolution)
-    threads = available_threads()
+    threads, taken = available_threads(), config.delta_frames
+    name = f"{avatar.n // 1000}k, K={len(avatar.blendshape_names)}, SH {degree}"
+    figures, total = [], 0.0
     with one_torch_thread():
         state = TrainState.start(avatar, 0)
-        state.step = config.steps // 2  # the full SH degree is active
         stepper = Stepper(
             state,
             avatar,
@@ -56,14 +58,20 @@ def whole_step(degree: int) -> Figure:
             render.get("native", threads),
             render.kernels("native", threads),
         )
-        seconds = wall_seconds(stepper.step, budget=10.0)
-    floor = step_bytes(state) / limits.bandwidth()
-    name = f"{avatar.n // 1000}k, K={len(avatar.blendshape_names)}, SH {degree}, {config.resolution} px: whole step"
-    return Figure(f"{name}, {threads} threads, wall", 1e3 * seconds, "ms", PAPER_STEP_MS, 1e3 * floor)
+        coarse = config.coarse_share
+        for side, first, share in ((2, 0.5 * coarse, coarse), (1, 0.5 + 0.5 * coarse, 1 - coarse)):
+            state.step = int(first * config.steps)  # every SH degree is active
+            seconds = wall_seconds(lambda: [stepper.step() for _ in range(taken)], budget=15.0) / taken
+            total += share * config.steps * seconds
+            what = f"{name}, {config.resolution // side} px: whole step, {threads} threads, wall"
+            floor = step_bytes(state) / taken / limits.bandwidth()
+            figures.append(Figure(what, 1e3 * seconds, "ms", PAPER_STEP_MS, 1e3 * floor))
+    figures.append(Figure(f"{name}: {config.steps} steps of such", total / 60, "min", PAPER_MINUTES))
+    return figures
 
 
 def step_bytes(state: TrainState) -> float:
-    """Least memory traffic of blending and of Adam: pairs that move are read once, then read and written thrice."""
+    """Least memory traffic of blending and of a step of the deltas: read once, then read and written thrice."""
     per_gaussian = sum(tensor[0].numel() for _, tensor in each(state.neutral.values))
     pairs = int((state.scale != 0).sum()) + len(state.driver.values.means) * state.counts.face
     return (ADAM_BYTES + BLEND_BYTES) * per_gaussian * pairs

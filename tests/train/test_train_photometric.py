@@ -12,11 +12,12 @@ from make import TINY, tiny_avatar, tiny_head, tiny_sequence
 from toonifygb import render
 from toonifygb.avatar import Avatar, init_avatar
 from toonifygb.geometry.rotations import matrix_to_axis_angle
+from toonifygb.progress import Stopped
 from toonifygb.structures import TrackedSequence
 from toonifygb.train import Dataset, build_dataset, photometric, refine_track
 from toonifygb.train.photometric import _Look
 from toonifygb.train.poses import RIGID, Poses, carried
-from toonifygb.train.state import TrainState
+from toonifygb.train.state import TrainState, read_checkpoint
 from toonifygb.train.step import Stepper
 
 if TYPE_CHECKING:
@@ -170,8 +171,20 @@ def test_poses_are_found_in_both_sets(tmp_path: Path, monkeypatch: pytest.Monkey
         assert after[frames].mean() < 0.85 * before[frames].mean()
     assert torch.equal(found.motion.joints[:, 3:], wrong.motion.joints[:, 3:])  # gaze
     assert torch.equal(found.motion.joints[:, 0], wrong.motion.joints[:, 0])
-    again = refine_track(dataset, wrong, tiny_head(), threads=2)
-    assert torch.equal(again.motion.joints, found.motion.joints)
+
+    class StopAfterTwoPasses:
+        def update(self, done: int, total: int | None, **figures: float) -> None:
+            if done == 150 + 2 * N:
+                raise Stopped
+
+    checkpoint = tmp_path / "refine.safetensors"
+    with pytest.raises(Stopped):
+        refine_track(dataset, wrong, tiny_head(), threads=2, checkpoint=checkpoint, progress=StopAfterTwoPasses())
+    written = read_checkpoint(checkpoint)[0].step
+    assert written in photometric.PASSES
+    again = refine_track(dataset, wrong, tiny_head(), threads=2, checkpoint=checkpoint)
+    for name, values in vars(found.motion).items():
+        assert torch.equal(getattr(again.motion, name), values), name
 
 
 def test_reduced_targets_are_means_of_pixels(tmp_path: Path) -> None:

@@ -312,9 +312,10 @@ def test_checkpoint_round_trip_and_damage(clip: tuple[Dataset, TrackedSequence],
     state = TrainState.start(first_avatar(dataset, sequence, tiny_head(), TINY), 5)
     state.next_frame(dataset.split.train)
     path = tmp_path / "checkpoint.safetensors"
-    write_checkpoint(state, path, {"fingerprint": "x"})
-    again, facts = read_checkpoint(path)
+    write_checkpoint(state, path, {"fingerprint": "x"}, {"more": torch.arange(3)})
+    again, facts, beside = read_checkpoint(path)
     assert facts["fingerprint"] == "x"
+    assert list(beside) == ["more"] and torch.equal(beside["more"], torch.arange(3))
     frames = [[s.next_frame(dataset.split.train) for _ in range(40)] for s in (state, again)]
     assert frames[0] == frames[1]
     assert torch.equal(state.expression.values.sh, again.expression.values.sh)

@@ -270,6 +270,7 @@ def finish_track(run: Run, config: RunConfig, fitted: str, cut: str | None) -> s
     """The final track: head poses fitted to the pixels of the crops, or as the landmarks have them."""
     out = run.file("track.safetensors")
     dataset = cut if config.track.photometric else None
+    checkpoint = run.work("refine.safetensors")
 
     def work(progress: Progress) -> None:
         sequence = track.load(run.work(LANDMARK_TRACK))
@@ -281,9 +282,11 @@ def finish_track(run: Run, config: RunConfig, fitted: str, cut: str | None) -> s
                 seed=config.train.seed,
                 backend=config.backend,
                 threads=config.threads,
+                checkpoint=checkpoint,
                 progress=progress,
             )
         track.save(sequence, out)
+        checkpoint.unlink(missing_ok=True)
 
     title = "keeping the track" if dataset is None else "refining the track"
     return run.stage("refine", title, inputs=[fitted, dataset, config.train.seed], outputs=[out], work=work)

@@ -74,7 +74,7 @@ def train(
     folder.mkdir(parents=True, exist_ok=True)
     with one_torch_thread():
         template = first_avatar(dataset, sequence, head, config)
-        facts = {"fingerprint": _fingerprint(config, dataset, sequence)}
+        facts = {"fingerprint": fingerprint(config, dataset, sequence)}
         renderer, kernels = render.get(backend, threads), render.kernels(backend, threads)
         state = (_resumed(folder, facts) or TrainState.start(template, config.seed)).to(kernels.device)
         stepper = Stepper(state, template, dataset, sequence, config, renderer, kernels)
@@ -177,7 +177,7 @@ def _resumed(folder: Path, wanted: dict[str, str]) -> TrainState | None:
     path = folder / CHECKPOINT
     if not path.is_file():
         return None
-    state, facts = read_checkpoint(path)
+    state, facts, _ = read_checkpoint(path)
     if facts.get("fingerprint") != wanted["fingerprint"]:
         log.info("checkpoint %s belongs to another training; starting anew", path)
         return None
@@ -185,7 +185,7 @@ def _resumed(folder: Path, wanted: dict[str, str]) -> TrainState | None:
     return state
 
 
-def _fingerprint(config: TrainConfig, dataset: Dataset, sequence: TrackedSequence) -> str:
+def fingerprint(config: TrainConfig, dataset: Dataset, sequence: TrackedSequence) -> str:
     """What a training depends on; a checkpoint of another one is not continued."""
     settings = dataclasses.asdict(replace(config, checkpoint_seconds=0.0))
     digest = hashlib.sha256(f"{json.dumps(settings, sort_keys=True)}\n{dataset.fingerprint}".encode())

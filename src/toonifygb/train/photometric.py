@@ -10,7 +10,7 @@ clip do as well (3DGB's among them). The direction of gaze stays that of the lan
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -22,13 +22,17 @@ from toonifygb.avatar.fields import each, rows
 from toonifygb.avatar.model import JAW
 from toonifygb.config import TrainConfig
 from toonifygb.progress import SILENT
+from toonifygb.structures import HeadMotion
 from toonifygb.threads import one_torch_thread
+from toonifygb.train.loop import fingerprint
 from toonifygb.train.poses import RIGID, Poses, carried
-from toonifygb.train.state import TrainState
+from toonifygb.train.state import TrainState, read_checkpoint, write_checkpoint
 from toonifygb.train.step import Stepper
 from toonifygb.train.views import TrainingViews
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from jaxtyping import Bool, Float, Int
     from torch import Tensor
 
@@ -75,6 +79,7 @@ def refine_track(
     seed: int = 0,
     backend: str = "auto",
     threads: int | None = None,
+    checkpoint: Path | None = None,
     progress: Progress = SILENT,
 ) -> TrackedSequence:
     """The track with head pose, jaw, eyelids and expression of every frame of the split fitted to its pixels.
@@ -89,6 +94,7 @@ def refine_track(
         seed: of the training.
         backend: rasteriser.
         threads: of the native engine.
+        checkpoint: file that is written after every pass; a call that finds it goes on from there.
         progress: told after every step and every fitted frame; figure ``turn_deg``, the mean of the last pass.
     """
     small = dataset.reduced(max(f for f in range(1, max(1, dataset.size // SIZE) + 1) if dataset.size % f == 0))
@@ -102,7 +108,8 @@ def refine_track(
         seed=seed,
     )
     renderer = render.get(backend, threads)
-    done, total, figures = 0, STEPS + len(PASSES) * len(frames), {}
+    facts = {"fingerprint": fingerprint(config, small, sequence)}
+    total = STEPS + len(PASSES) * len(frames)
     with one_torch_thread():
         avatar = init_avatar(
             head,
@@ -113,11 +120,14 @@ def refine_track(
             views=TrainingViews(small, sequence, head),
         )
         kernels = render.kernels(backend, threads)
-        state = TrainState.start(avatar, seed).to(kernels.device)
-        stepper = Stepper(state, avatar, small, sequence, config, renderer, kernels)
-        rigid = _above_chin(state, sequence, head)
         prior = _prior(avatar, head)
-        earlier = torch.zeros(sequence.n_frames, len(prior))
+        state = TrainState.start(avatar, seed)
+        rigid = _above_chin(state, sequence, head)
+        fresh = (state, sequence, torch.zeros(sequence.n_frames, len(prior)), {})
+        state, sequence, earlier, figures = _resumed(checkpoint, facts, sequence) or fresh
+        state = state.to(kernels.device)
+        stepper = Stepper(state, avatar, small, sequence, config, renderer, kernels)
+        done = state.step + sum(state.step >= number for number in PASSES) * len(frames)
         while state.step < STEPS:
             stepper.step()
             done += 1
@@ -136,7 +146,24 @@ def refine_track(
             sequence, earlier = poses.moved(changes), earlier + changes
             stepper.follow(sequence)
             figures = {"turn_deg": float(torch.rad2deg(changes[frames, :3].norm(dim=-1)).mean())}
+            if checkpoint is not None:
+                beside = {"earlier": earlier} | vars(sequence.motion)
+                write_checkpoint(state, checkpoint, facts | {"figures": figures}, beside)
     return sequence
+
+
+_Progressed = tuple[TrainState, "TrackedSequence", "Tensor", dict[str, float]]
+
+
+def _resumed(checkpoint: Path | None, wanted: dict[str, str], fitted: TrackedSequence) -> _Progressed | None:
+    """State, track, changes since the landmark track and figures after the last pass that was written."""
+    if checkpoint is None or not checkpoint.is_file():
+        return None
+    state, facts, beside = read_checkpoint(checkpoint)
+    if facts.get("fingerprint") != wanted["fingerprint"]:
+        return None
+    earlier = beside.pop("earlier")
+    return state, replace(fitted, motion=HeadMotion(**beside)), earlier, facts["figures"]
 
 
 def _above_chin(state: TrainState, sequence: TrackedSequence, head: HeadModel) -> Bool[Tensor, " n"]:

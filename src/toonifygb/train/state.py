@@ -23,6 +23,7 @@ from toonifygb.errors import InputError
 from toonifygb.structures import GaussianParams, TensorRecord
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from jaxtyping import Float, Int
@@ -192,6 +193,7 @@ class TrainState:
         )
 
 
+_BESIDE = "beside."
 _TENSORS = ("scale", "skin_weights", "pose_basis", "pull", "views", "order")
 _TRAINED: dict[str, type[TensorRecord]] = {
     "neutral": GaussianParams,
@@ -201,13 +203,23 @@ _TRAINED: dict[str, type[TensorRecord]] = {
 }
 
 
-def write_checkpoint(state: TrainState, path: Path, facts: dict[str, Any]) -> None:
-    """Writes the state atomically: a process killed at any moment leaves the old file or the new one."""
+def write_checkpoint(
+    state: TrainState, path: Path, facts: dict[str, Any], beside: Mapping[str, Tensor] | None = None
+) -> None:
+    """Writes the state atomically: a process killed at any moment leaves the old file or the new one.
+
+    Args:
+        state: of the training.
+        path: the file.
+        facts: further things to know, as JSON has them.
+        beside: further tensors, on the processor.
+    """
     state = state.to(torch.device("cpu"))
     tensors = {name: getattr(state, name) for name in _TENSORS}
     groups = [group for group in _TRAINED if getattr(state, group) is not None]
     tensors |= {name: tensor for group in groups for name, tensor in _named(group, getattr(state, group))}
     tensors |= {name: tensor for i, frame in enumerate(state.seen) for name, tensor in _named_frame(i, frame)}
+    tensors |= {f"{_BESIDE}{name}": tensor for name, tensor in (beside or {}).items()}
     tensors["generator"] = state.generator.get_state()
     counts = state.counts
     notes = facts | {
@@ -221,8 +233,8 @@ def write_checkpoint(state: TrainState, path: Path, facts: dict[str, Any]) -> No
         save_file({n: t.contiguous() for n, t in tensors.items()}, temporary, metadata={"state": json.dumps(notes)})
 
 
-def read_checkpoint(path: Path) -> tuple[TrainState, dict[str, Any]]:
-    """State and facts written by ``write_checkpoint``.
+def read_checkpoint(path: Path) -> tuple[TrainState, dict[str, Any], dict[str, Tensor]]:
+    """State, facts and further tensors written by ``write_checkpoint``.
 
     Raises:
         InputError: the file is damaged.
@@ -244,7 +256,7 @@ def read_checkpoint(path: Path) -> tuple[TrainState, dict[str, Any]]:
         )
     except (SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
         raise InputError(f"checkpoint {path} is damaged ({error})", "delete it to train from the start") from error
-    return state, notes
+    return state, notes, {key.removeprefix(_BESIDE): tensors[key] for key in tensors if key.startswith(_BESIDE)}
 
 
 def _named_frame(i: int, frame: Seen) -> list[tuple[str, Tensor]]:
