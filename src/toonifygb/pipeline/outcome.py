@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from toonifygb.pipeline.stages import Run
     from toonifygb.progress import Progress
     from toonifygb.structures import TrackedSequence
+    from toonifygb.train import Dataset
 
 _PANEL = 384
 """Side of each of the preview's four panels, px."""
@@ -39,6 +40,8 @@ _SWING_DEG, _SWING_LEAST_DEG, _SWING_BEYOND_DEG, _SWING_SECONDS = 35.0, 15.0, 10
 how long one swing there and back takes at most."""
 _LABELS = ("input", "stylised", "avatar", "avatar, moving view")
 _VIEWS_DEG = (-50.0, -25.0, 0.0, 25.0, 50.0)
+_EYES, _MOUTH, _CLOSE_MARGIN = (33, 263, 159, 145, 386, 374), (61, 291, 0, 17), 1.4
+"""Landmarks around both eyes and around the lips, and how much wider their squares in the report are."""
 _EXPRESSIONS: tuple[tuple[str, dict[str, float]], ...] = (
     ("calm", {}),
     ("jaw open", {"jawOpen": 0.5}),
@@ -200,7 +203,7 @@ def report_pictures(run: Run, config: RunConfig) -> dict[str, np.ndarray]:
     viewer = AvatarViewer(model, dataset.size, backend=config.backend, threads=config.threads)
     middle = model.motion_mean
     test = dataset.split.test or dataset.split.train
-    held_out = []
+    held_out, close = [], []
     for index in sorted({test[0], test[len(test) // 2], test[-1]}):
         viewer.look_through(dataset.camera(index))
         target = (dataset.target(index)[0] * 255).round().to(torch.uint8).numpy()
@@ -210,16 +213,39 @@ def report_pictures(run: Run, config: RunConfig) -> dict[str, np.ndarray]:
                 [target, image, pictures.error_map(image, target)], ("held out", "avatar", "difference × 4"), 360
             )
         )
+        places = face_parts(sequence, dataset, index)
+        cuts = [pictures.cut(picture, place) for place in places for picture in (target, image)]
+        if cuts:
+            close.append(pictures.row(cuts, ("eyes, held out", "avatar", "mouth, held out", "avatar"), 270))
     viewer.look_through(dataset.camera(dataset.split.train[len(dataset.split.train) // 2]))
     views = viewer.frames(middle, [(yaw, 0.0) for yaw in _VIEWS_DEG])
     shown = expressions(model)
     faces = [viewer.frame(posed(model, weights)) for _, weights in shown]
-    return {
+    found = {
         "1-held-out": pictures.stack(held_out),
-        "2-views": pictures.row(views, [f"{yaw:+.0f} deg" for yaw in _VIEWS_DEG], 240),
-        "3-expressions": pictures.row(faces, [name for name, _ in shown], 200),
-        "4-tracking": overlay_sheet(run, sequence),
+        "3-views": pictures.row(views, [f"{yaw:+.0f} deg" for yaw in _VIEWS_DEG], 240),
+        "4-expressions": pictures.row(faces, [name for name, _ in shown], 200),
+        "5-tracking": overlay_sheet(run, sequence),
     }
+    return found | ({"2-close": pictures.stack(close)} if close else {})
+
+
+def face_parts(sequence: TrackedSequence, dataset: Dataset, index: int) -> list[tuple[int, int, int]]:
+    """Squares around the eyes and the mouth of a frame: left, top and side in px of its crop; none where no
+    landmarks were found.
+    """
+    points = sequence.landmarks.points[index]
+    if not points.isfinite().all():
+        return []
+    left, top, right, _ = (float(edge) for edge in dataset.boxes[index])
+    points = (points - points.new_tensor([left, top])) * (dataset.size / (right - left))
+    squares = []
+    for part in (_EYES, _MOUTH):
+        low, high = points[list(part)].amin(0), points[list(part)].amax(0)
+        side = _CLOSE_MARGIN * float((high - low).max())
+        x, y = ((low + high - side) / 2).tolist()
+        squares.append((round(x), round(y), round(side)))
+    return squares
 
 
 def expressions(model: avatars.Avatar) -> list[tuple[str, dict[str, float]]]:
@@ -240,9 +266,10 @@ def overlay_sheet(run: Run, sequence: TrackedSequence) -> np.ndarray:
 
 _CAPTIONS = {
     "1-held-out": "Frames the training never saw: the target, the avatar, and the difference.",
-    "2-views": "The mean pose from new views.",
-    "3-expressions": "Expressions set by name.",
-    "4-tracking": "The head model on the clip.",
+    "2-close": "Their eyes and mouths.",
+    "3-views": "The mean pose from new views.",
+    "4-expressions": "Expressions set by name.",
+    "5-tracking": "The head model on the clip.",
 }
 
 
@@ -269,7 +296,8 @@ def report_page(source: Source, run: Run, config: RunConfig, values: dict[str, A
         ("peak memory", f"{values['peak_memory_mb']:.0f} MB"),
         *((name, str(version)) for name, version in values["versions"].items()),
     ]
-    captions = [Picture((sheet / f"{name}.jpg").read_bytes(), caption) for name, caption in _CAPTIONS.items()]
+    drawn = [(sheet / f"{name}.jpg", caption) for name, caption in _CAPTIONS.items()]
+    captions = [Picture(path.read_bytes(), caption) for path, caption in drawn if path.is_file()]
     return Report(
         title=f"{source.path.stem} · {config.stylize.style}",
         lead=f"{config.quality} quality, made by toonifygb {__version__}",

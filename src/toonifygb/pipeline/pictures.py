@@ -21,6 +21,15 @@ def fit(image: np.ndarray, size: int) -> np.ndarray:
     return cv2.resize(image, (size, size), interpolation=method)
 
 
+def cut(image: np.ndarray, square: tuple[int, int, int]) -> np.ndarray:
+    """A square (left, top, side, px) of an image; what lies outside is black."""
+    left, top, side = square
+    height, width = image.shape[:2]
+    x, y = side + min(max(left, -side), width), side + min(max(top, -side), height)
+    padded = np.pad(image, ((side, side), (side, side), (0, 0)))
+    return np.ascontiguousarray(padded[y : y + side, x : x + side])
+
+
 def row(images: Sequence[np.ndarray], labels: Sequence[str] = (), size: int | None = None) -> np.ndarray:
     """Square images side by side, each under its label.
 
