@@ -112,7 +112,7 @@ class TrainConfig:
     steps: int = 3_000
     """Optimiser steps, one frame each."""
     coarse_share: float = 0.0
-    """Share of the steps, the first ones, that compare at half the resolution."""
+    """Share of the steps, the first ones, that compare at half the resolution, where that is even."""
     delta_frames: int = 1
     """Steps to every step of the blendshapes' changes, which are most of the numbers and move slowly."""
     sh_degree: int = 1

@@ -131,7 +131,7 @@ class Stepper:
         state.step += 1
         gradient, terms = self._gradient(index, background, info)
         self._optimizer.step(state, gradient, self._frame(index).psi)
-        if not state.seen:
+        if not state.seen or state.mixer is not None:  # deltas, or the weights of bases, are others now
             self._changed_in = []
         return terms
 
@@ -181,9 +181,9 @@ class Stepper:
         )
 
     def _looked_at(self) -> Dataset:
-        """The training set, at half its resolution in the first steps."""
+        """The training set, at half its resolution in the first steps; crops of odd size have no half."""
         coarse = self.state.step <= self._config.coarse_share * self._config.steps
-        return self._dataset.reduced(2) if coarse else self._dataset
+        return self._dataset.reduced(2) if coarse and self._dataset.size % 2 == 0 else self._dataset
 
     def _frame(self, index: int) -> _Frame:
         return _Frame(self._coefficients(self._psi[index]), self._features[index], self._transforms[index])
