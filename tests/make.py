@@ -18,6 +18,7 @@ TINY = TrainConfig(
     n_mouth_gaussians=40,
     resolution=48,
     steps=40,
+    delta_frames=1,
     sh_degree=1,
     test_share=0.2,
     checkpoint_seconds=1e9,

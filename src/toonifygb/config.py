@@ -113,7 +113,7 @@ class TrainConfig:
     """Optimiser steps, one frame each."""
     coarse_share: float = 0.0
     """Share of the steps, the first ones, that compare at half the resolution, where that is even."""
-    delta_frames: int = 1
+    delta_frames: int = 8
     """Steps to every step of the blendshapes' changes, which are most of the numbers and move slowly."""
     sh_degree: int = 1
     """Degree of the view-dependent colour, reached step by step."""
@@ -248,7 +248,6 @@ PAPER = TrainConfig(
     resolution=512,
     steps=40_000,
     sh_degree=3,
-    delta_frames=8,
     coarse_share=0.5,
 )
 PRESETS: dict[Quality, TrainConfig] = {"draft": DRAFT, "standard": STANDARD, "paper": PAPER}

@@ -104,6 +104,7 @@ def refine_track(
         n_mouth_gaussians=1_000,
         resolution=small.size,
         steps=STEPS,
+        delta_frames=1,
         blendshapes="full",  # the units' own deltas are what the slopes of expressions come from
         seed=seed,
     )
