@@ -36,7 +36,7 @@ from toonifygb.train.optim import (
     mixer_gradient,
     settling,
 )
-from toonifygb.train.state import TrainState, read_checkpoint, write_checkpoint
+from toonifygb.train.state import Seen, TrainState, read_checkpoint, write_checkpoint
 from toonifygb.train.step import Stepper
 
 if TYPE_CHECKING:
@@ -311,11 +311,20 @@ def test_checkpoint_round_trip_and_damage(clip: tuple[Dataset, TrackedSequence],
     dataset, sequence = clip
     state = TrainState.start(first_avatar(dataset, sequence, tiny_head(), TINY), 5)
     state.next_frame(dataset.split.train)
+    gradient = state.neutral.values.map(lambda tensor: tensor[: state.counts.face])
+    psi = torch.rand(48)
+    state.seen = [
+        Seen(psi[:40], psi[40:], gradient)
+    ] * 2  # one frame at the end of an epoch and at the next one's start
     path = tmp_path / "checkpoint.safetensors"
     write_checkpoint(state, path, {"fingerprint": "x"}, {"more": torch.arange(3)})
     again, facts, beside = read_checkpoint(path)
     assert facts["fingerprint"] == "x"
     assert list(beside) == ["more"] and torch.equal(beside["more"], torch.arange(3))
+    assert len(again.seen) == 2
+    for frame in again.seen:
+        assert torch.equal(frame.expression, psi[:40]) and torch.equal(frame.driver, psi[40:])
+        assert torch.equal(frame.gradient.sh, gradient.sh)
     frames = [[s.next_frame(dataset.split.train) for _ in range(40)] for s in (state, again)]
     assert frames[0] == frames[1]
     assert torch.equal(state.expression.values.sh, again.expression.values.sh)

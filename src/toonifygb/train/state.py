@@ -260,8 +260,9 @@ def read_checkpoint(path: Path) -> tuple[TrainState, dict[str, Any], dict[str, T
 
 
 def _named_frame(i: int, frame: Seen) -> list[tuple[str, Tensor]]:
-    own = [(f"seen.{i}.{name}", getattr(frame, name)) for name in ("expression", "driver")]
-    return own + [(f"seen.{i}.gradient.{name}", tensor) for name, tensor in vars(frame.gradient).items()]
+    # Copies: a frame that is seen twice has the same coefficients, and a file may not name one memory twice.
+    own = [(f"seen.{i}.{name}", getattr(frame, name).clone()) for name in ("expression", "driver")]
+    return own + [(f"seen.{i}.gradient.{name}", tensor.clone()) for name, tensor in vars(frame.gradient).items()]
 
 
 def _frame(i: int, tensors: dict[str, Tensor]) -> Seen:
