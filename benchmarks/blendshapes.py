@@ -33,7 +33,8 @@ class _Training:
         self._template = avatar
         self._kernels = render.kernels("native", 1)
         self.state = TrainState.start(avatar, 0)
-        self._optimizer = Optimizer(self.state, DRAFT.steps, DRAFT.delta_frames, self._kernels)
+        # One frame to a step of the deltas: the median of steps would never see one in eight.
+        self._optimizer = Optimizer(self.state, DRAFT.steps, 1, self._kernels)
         values = self.state.neutral.values
         generator = torch.Generator().manual_seed(0)
         self._gradient: GaussianParams = values.map(lambda t: 1e-3 * torch.randn(t.shape, generator=generator))

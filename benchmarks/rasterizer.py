@@ -51,7 +51,7 @@ def _scene_figures(size: int, n_head: int, n_mouth: int, degree: int, *, repeats
     splats, camera = scenes.head(n_head, n_mouth, degree), scenes.camera(size)
     name = f"{(n_head + n_mouth) // 1000}k Gaussians, {size} px, SH {degree}"
     forward, both = _jobs(render.get("native", 1), splats, camera)
-    plain = [1e3 * _once(job, repeats) for job in _jobs(render.get("reference"), splats, camera)]
+    plain = [1e3 * _shortest(job, repeats) for job in _jobs(render.get("reference"), splats, camera)]
     lanes = _blocks(splats, camera) * LANES
     floors = [1e3 * lanes * count / limits.flops() for count in (FORWARD_FLOPS, FORWARD_FLOPS + BACKWARD_FLOPS)]
     figures = [
@@ -65,7 +65,7 @@ def _scene_figures(size: int, n_head: int, n_mouth: int, degree: int, *, repeats
     return figures
 
 
-def _once(job: Callable[[], object], repeats: int) -> float:
+def _shortest(job: Callable[[], object], repeats: int) -> float:
     """Shortest processor time of the slow reference, s; no warm-up."""
     times = []
     for _ in range(repeats):
