@@ -32,6 +32,9 @@ def test_override_changes_one_setting() -> None:
         ("train.steps=1.5", "expected int"),
         ("train.loss=mse", "expected one of 3dgb, seed"),
         ("max_frames=x", "expected int or null"),
+        ("train.test_parts=0", "expected 1 or more"),
+        ("train.dropout=1", "expected 0 or more, and less than 1"),
+        ("train.dropout=-0.1", "expected 0 or more, and less than 1"),
     ],
 )
 def test_bad_settings_are_said_in_one_sentence(assignment: str, sentence: str) -> None:

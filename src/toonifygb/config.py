@@ -115,6 +115,9 @@ class TrainConfig:
     """Share of the steps, the first ones, that compare at half the resolution, where that is even."""
     delta_frames: int = 8
     """Steps to every step of the blendshapes' changes, which are most of the numbers and move slowly."""
+    dropout: float = 0.2
+    """Share of the Gaussians, chosen at random, that every step does without; it keeps poses beyond the clip's
+    clean."""
     sh_degree: int = 1
     """Degree of the view-dependent colour, reached step by step."""
     blendshapes: Blendshapes = "full"
@@ -142,11 +145,25 @@ class TrainConfig:
     checkpoint_seconds: float = 30.0
     """Time between checkpoints."""
     test_share: float = 0.15
-    """Share of the clip's end held out from training."""
+    """Share of the clip held out from training."""
+    test_parts: int = 1
+    """Where that is: the end of the clip (1, which is 3DGB's), or the ends of so many equal parts of it, which says
+    less of poses that were never filmed and more of all others."""
     max_test_frames: int = 350
     """Most frames held out."""
     seed: int = 0
     """Seed of every random choice."""
+
+    def __post_init__(self) -> None:
+        """Refuses what no training can do.
+
+        Raises:
+            InputError: a share of Gaussians to leave out that leaves none, or no part to hold out.
+        """
+        if not 0 <= self.dropout < 1:
+            raise InputError(f"setting train.dropout is {self.dropout}; expected 0 or more, and less than 1")
+        if self.test_parts < 1:
+            raise InputError(f"setting train.test_parts is {self.test_parts}; expected 1 or more")
 
 
 @dataclass(frozen=True)

@@ -102,6 +102,18 @@ def test_end_is_held_out_and_lost_frames_are_in_neither_set() -> None:
     assert limited.test == (18, 19)
 
 
+def test_the_held_out_share_can_be_taken_from_several_parts() -> None:
+    sequence = tiny_sequence(30)
+    split = split_frames(sequence, replace(CONFIG, test_share=0.2, test_parts=3))
+    assert split.test == (8, 9, 18, 19, 28, 29)
+    assert sorted(split.train + split.test) == list(range(30))
+    uneven = split_frames(sequence, replace(CONFIG, test_share=0.2, test_parts=4))
+    assert len(uneven.test) == 6 and uneven.test[-1] == 29
+    for parts in (29, 30, 100):  # shorter than a frame: still the same number, none twice
+        many = split_frames(sequence, replace(CONFIG, test_share=0.2, test_parts=parts))
+        assert len(many.test) == 6
+
+
 def test_finished_set_is_taken_as_it_is(tmp_path: Path) -> None:
     sequence = tiny_sequence(20, 64)
     first = build_dataset(pairs(sequence), sequence, tiny_head(), CONFIG, tmp_path)

@@ -32,6 +32,7 @@ from toonifygb.train.optim import (
     MIXER_EPS,
     MIXER_RATE,
     NEUTRAL_RATES,
+    NEUTRAL_TRAVEL,
     means_decay,
     mixer_gradient,
     settling,
@@ -78,8 +79,9 @@ def same(a: Avatar, b: Avatar) -> bool:
 class PlainTraining:
     """The training written with autograd, ``Avatar.pose`` and ``torch.optim.Adam``."""
 
-    def __init__(self, template: Avatar, delta_frames: int) -> None:
-        self.frames = delta_frames
+    def __init__(self, template: Avatar, config: TrainConfig) -> None:
+        self.frames = delta_frames = config.delta_frames
+        self.dropout = config.dropout
         self.state = TrainState.start(template, TINY.seed)
         self.template = template
         self.scale = torch.ones(len(template.deltas.means), self.state.counts.face)
@@ -96,7 +98,9 @@ class PlainTraining:
         for name in FIELDS:
             key = "sh_dc" if name == "sh" else name
             faster = FULL_STEPS / TINY.steps if name in {"means", "opacity_logits"} else 1
-            self.add([getattr(part, name) for part in self.sets], NEUTRAL_RATES[key], name != "means", 1e-15)
+            farther = NEUTRAL_TRAVEL if name == "means" else 1  # a training of few steps
+            rate = NEUTRAL_RATES[key] * farther
+            self.add([getattr(part, name) for part in self.sets], rate, name != "means", 1e-15)
             own, driver = (getattr(part, name) for part in self.trained)
             own_eps, rate = DELTA_EPS if template.mixer is None else BASIS_EPS, DELTA_RATES[key] * faster
             for tensor, lr, eps in (
@@ -137,9 +141,12 @@ class PlainTraining:
         neutral, upper, lower = self.sets
         sets = {"neutral": neutral, "mouth_upper": upper, "mouth_lower": lower, "deltas": self.deltas()}
         avatar = replace(self.template, **sets, mixer=self.mixer)
-        image = render.get("auto", 1).render(
-            avatar.pose(sequence.motion[index]), dataset.camera(index), background=background, sh_degree=0
-        )
+        splats = avatar.pose(sequence.motion[index])
+        if self.dropout:
+            drawn = torch.rand(splats.means.shape[0], generator=self.state.generator)
+            lit = torch.where(drawn < self.dropout, 0.0, splats.opacities / (1 - self.dropout))
+            splats = replace(splats, opacities=lit)
+        image = render.get("auto", 1).render(splats, dataset.camera(index), background=background, sh_degree=0)
         weights = LossWeights.of(TINY)
         color, matte = dataset.target(index)
         loss = image_loss(image, color + (1 - matte)[..., None] * background, matte, weights)
@@ -162,7 +169,9 @@ class DegreeZero(Stepper):
 
 
 @pytest.mark.parametrize(
-    "config", [TINY, replace(TINY, delta_frames=2), REDUCED], ids=["full", "two frames", "reduced"]
+    "config",
+    [TINY, replace(TINY, delta_frames=2), replace(TINY, dropout=0.0), REDUCED],
+    ids=["full", "two frames", "nothing left out", "reduced"],
 )
 def test_fast_step_equals_the_plain_one(clip: tuple[Dataset, TrackedSequence], config: TrainConfig) -> None:
     """Two steps of the deltas, every parameter."""
@@ -173,7 +182,7 @@ def test_fast_step_equals_the_plain_one(clip: tuple[Dataset, TrackedSequence], c
     stretched = template.neutral.log_scales + torch.tensor([0.4, 0.0, -0.4])
     turned = template.neutral.quats + torch.tensor([0.3, 0.5, -0.4, 0.2])
     template = replace(template, neutral=replace(template.neutral, log_scales=stretched, quats=turned))
-    state, plain = TrainState.start(template, TINY.seed), PlainTraining(template, config.delta_frames)
+    state, plain = TrainState.start(template, TINY.seed), PlainTraining(template, config)
     first = join([template.neutral, template.mouth_upper, template.mouth_lower])
     backends = render.get("auto", 1), render.kernels("auto", 1)
     stepper = DegreeZero(state, template, dataset, sequence, config, *backends)
@@ -351,6 +360,30 @@ def test_every_epoch_takes_each_frame_once(clip: tuple[Dataset, TrackedSequence]
     epochs = [[state.next_frame(frames) for _ in frames] for _ in range(3)]
     assert all(sorted(epoch) == sorted(frames) for epoch in epochs)
     assert epochs[0] != epochs[1]
+
+
+def test_a_share_is_left_out_and_the_others_stand_in(clip: tuple[Dataset, TrackedSequence]) -> None:
+    """Other Gaussians every step; who is left out neither shows nor learns colour in it."""
+    dataset, sequence = clip
+    config = replace(TINY, dropout=0.3, steps=1)
+    template = first_avatar(dataset, sequence, tiny_head(), config)
+    state = TrainState.start(template, 0)
+    drawn = torch.stack([kept for _ in range(200) if (kept := state.next_kept(0.3)) is not None])
+    assert len(drawn) == 200 and drawn.unique().tolist() == pytest.approx([0.0, 1 / 0.7])
+    assert abs(drawn.mean() - 1) < 0.01 and drawn.mean(0).std() < 0.06
+    assert state.next_kept(0.0) is None
+
+    ahead = TrainState.start(template, 0)
+    ahead.next_frame(dataset.split.train)
+    ahead.next_background()
+    kept = ahead.next_kept(0.3)
+    assert kept is not None
+    before = TrainState.start(template, 0).neutral.values.sh.clone()
+    state = TrainState.start(template, 0)
+    Stepper(state, template, dataset, sequence, config, render.get("auto", 1), render.kernels("auto", 1)).step()
+    learnt = (state.neutral.values.sh != before).any(-1).any(-1)
+    assert not learnt[kept == 0].any()
+    assert learnt[kept > 0].any()
 
 
 @pytest.mark.parametrize("config", [TINY, REDUCED], ids=["full", "reduced"])

@@ -341,7 +341,7 @@ def cut_dataset(source: Source, run: Run, config: RunConfig, fitted: str, styled
         pairs = head_frames(photos, frames, sequence, model)
         train.build_dataset(pairs, sequence, model, training, out, progress=progress)
 
-    keys = ("resolution", "crop_scale", "test_share", "max_test_frames")
+    keys = ("resolution", "crop_scale", "test_share", "max_test_frames", "test_parts")
     settings = {key: getattr(training, key) for key in keys}
     return run.stage(
         "dataset",

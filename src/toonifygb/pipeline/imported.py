@@ -89,7 +89,7 @@ def train_config(source: Source, config: RunConfig) -> TrainConfig:
     """Settings of the training set: a dataset says itself how many frames at its end are held out."""
     if source.foreign is None:
         return config.train
-    return replace(config.train, test_share=1.0, max_test_frames=source.foreign.n_test)
+    return replace(config.train, test_share=1.0, max_test_frames=source.foreign.n_test, test_parts=1)
 
 
 def head_pictures(source: Source, run: Run, config: RunConfig) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -196,13 +196,16 @@ def load_dataset(folder: Path | str) -> Dataset:
 
 
 def split_frames(sequence: TrackedSequence, config: TrainConfig) -> Split:
-    """The clip's end is held out; frames where the face was lost are in neither set."""
+    """The end of the clip is held out, or that of every part; frames where the face was lost are in neither set."""
     n = sequence.n_frames
     n_test = min(config.max_test_frames, round(config.test_share * n))
+    bounds = np.linspace(0, n, config.test_parts + 1).round().astype(int)
+    each = np.diff(np.linspace(0, n_test, config.test_parts + 1).round().astype(int))
+    held_out = {i for end, count in zip(bounds[1:], each, strict=True) for i in range(end - count, end)}
     usable = [index for index in range(n) if bool(sequence.tracked[index])]
     return Split(
-        tuple(index for index in usable if index < n - n_test),
-        tuple(index for index in usable if index >= n - n_test),
+        tuple(index for index in usable if index not in held_out),
+        tuple(index for index in usable if index in held_out),
     )
 
 
@@ -305,6 +308,7 @@ def _fingerprint(sequence: TrackedSequence, config: TrainConfig) -> dict[str, An
         "crop_scale": config.crop_scale,
         "test_share": config.test_share,
         "max_test_frames": config.max_test_frames,
+        "test_parts": config.test_parts,
     }
 
 

@@ -105,6 +105,7 @@ def refine_track(
         resolution=small.size,
         steps=STEPS,
         delta_frames=1,
+        dropout=0.0,
         blendshapes="full",  # the units' own deltas are what the slopes of expressions come from
         seed=seed,
     )

@@ -175,6 +175,20 @@ class TrainState:
         """
         return torch.rand(3, generator=self.generator)
 
+    def next_kept(self, dropout: float) -> Float[Tensor, " n"] | None:
+        """What the next step multiplies the opacities with: 0 for those left out, 1 / (1 - dropout) for the others.
+
+        DropGaussian (Park 2025, eqs. 3 and 4) for clips that show a head from few sides: whatever is left must make
+        the picture, so none hides behind others with colours of its own, and no pattern of many is learnt by heart.
+
+        Args:
+            dropout: share of the Gaussians left out, chosen at random; ``None`` is returned for 0.
+        """
+        if dropout == 0:
+            return None
+        drawn = torch.rand(self.counts.all, generator=self.generator)
+        return ((drawn >= dropout).float() / (1 - dropout)).to(self.skin_weights.device)
+
     def avatar(self, template: Avatar) -> Avatar:
         """The avatar that the parameters make of ``template``; everything is copied."""
         counts, values = self.counts, self.neutral.values.map(torch.clone)

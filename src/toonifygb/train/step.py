@@ -7,7 +7,7 @@ allocates little and its work stays in the fused kernels. ``tests/train`` holds 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -128,8 +128,9 @@ class Stepper:
         state = self.state
         index = state.next_frame(self._dataset.split.train)
         background = state.next_background().to(self._kernels.device)
+        kept = state.next_kept(self._config.dropout)
         state.step += 1
-        gradient, terms = self._gradient(index, background, info)
+        gradient, terms = self._gradient(index, background, kept, info)
         self._optimizer.step(state, gradient, self._frame(index).psi)
         if not state.seen or state.mixer is not None:  # deltas, or the weights of bases, are others now
             self._changed_in = []
@@ -153,7 +154,7 @@ class Stepper:
         """
         black = torch.zeros(3, device=self._kernels.device)
         blended = blend(self.state, self._frame(index).psi, self._kernels)
-        return self._pull(self._dataset, index, blended, errors, black, None)
+        return self._pull(self._dataset, index, blended, errors, black, None, None)
 
     def _pull(
         self,
@@ -162,10 +163,13 @@ class Stepper:
         blended: GaussianParams,
         errors: ImageErrors,
         background: Float[Tensor, " 3"],
+        kept: Float[Tensor, " n"] | None,
         info: RenderInfo | None,
     ) -> Pull:
         frame = self._frame(index)
         raw, splats = self._skinned(frame, blended)
+        if kept is not None:
+            splats = replace(splats, opacities=splats.opacities * kept)
         leaves = _leaves(splats)
         cut_off = Splats(*leaves, sh_frames=splats.sh_frames)
         camera = dataset.camera(index)
@@ -176,6 +180,8 @@ class Stepper:
         )
         slopes = errors(rendering, *target)
         world = Splats(*torch.autograd.grad([rendering.color, rendering.alpha], leaves, slopes))
+        if kept is not None:
+            world = replace(world, opacities=world.opacities * kept)
         return Pull(
             splats, world, self._kernels.skin_gradient(raw, self.state.skin_weights, frame.transforms, world)
         )
@@ -226,7 +232,11 @@ class Stepper:
         return raw, self._kernels.skin(raw, self.state.skin_weights, frame.transforms)
 
     def _gradient(
-        self, index: int, background: Float[Tensor, " 3"], info: RenderInfo | None
+        self,
+        index: int,
+        background: Float[Tensor, " 3"],
+        kept: Float[Tensor, " n"] | None,
+        info: RenderInfo | None,
     ) -> tuple[GaussianParams, LossTerms]:
         """Gradient of the whole objective for the blended raw parameters of one frame."""
         terms = LossTerms(0.0, 0.0, 0.0)
@@ -237,7 +247,7 @@ class Stepper:
             )
             return v_color, v_alpha
 
-        gradient = self._pull(self._looked_at(), index, self._blended(index), errors, background, info).raw
+        gradient = self._pull(self._looked_at(), index, self._blended(index), errors, background, kept, info).raw
         terms.mouth = self._add_mouth_gradient(gradient)
         return gradient, terms
 
