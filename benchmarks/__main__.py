@@ -10,7 +10,7 @@ import benchmarks
 from benchmarks import harness
 
 SUPPORT = {"__main__", "harness", "scenes", "limits", "gpu"}
-ON_REQUEST = {"memory", "styleganex", "styleganex_clip", "styleganex_steady", "styleganex_tried"}
+ON_REQUEST = {"avatar_size", "memory", "styleganex", "styleganex_clip", "styleganex_steady", "styleganex_tried"}
 """Run only when named: a part of another one, or long work about one room."""
 
 

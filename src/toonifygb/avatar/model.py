@@ -11,13 +11,13 @@ from toonifygb.avatar.bases import Mixer
 from toonifygb.avatar.skinning import activate, blend_parameters, concatenate, pose_offsets, skin_splats
 from toonifygb.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from toonifygb.geometry.skinning import blend_transforms, joint_transforms, pose_feature
+from toonifygb.head import JAW, NECK, ROOT
 from toonifygb.structures import Camera, GaussianParams, HeadMotion, Splats, TensorRecord
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-ROOT, NECK, JAW = 0, 1, 2
 POSE_DRIVERS = ("jaw_open", "head_pitch", "head_yaw", "head_roll", "head_x", "head_y", "head_z")
 """Quantities of the pose that drive blendshapes of their own: skin folds and light change with them."""
 
@@ -45,9 +45,14 @@ class PoseDrivers(TensorRecord):
 
 def pose_quantities(motion: HeadMotion) -> Float[Tensor, "*b d"]:
     """The pose quantities of ``POSE_DRIVERS``: jaw opening, head rotation vector (x, y, z), translation."""
-    rotations = axis_angle_to_matrix(motion.joints[..., : NECK + 1, :])
-    head = matrix_to_axis_angle(rotations[..., ROOT, :, :] @ rotations[..., NECK, :, :])
+    head = matrix_to_axis_angle(head_rotation(motion))
     return torch.cat([motion.joints[..., JAW, :1], head, motion.translation], dim=-1)
+
+
+def head_rotation(motion: HeadMotion) -> Float[Tensor, "*b 3 3"]:
+    """Head to world: the root's turn, then the neck's."""
+    turns = axis_angle_to_matrix(motion.joints[..., : NECK + 1, :])
+    return turns[..., ROOT, :, :] @ turns[..., NECK, :, :]
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from toonifygb.datasets.worlds import head_to_camera, to_pytorch3d
 from toonifygb.errors import InputError
 from toonifygb.geometry.cameras import crop_camera
 from toonifygb.geometry.rotations import axis_angle_to_matrix
+from toonifygb.head import JAW, NECK
 from toonifygb.progress import SILENT
 from toonifygb.structures import HeadMotion
 
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
     from toonifygb.progress import Progress
     from toonifygb.structures import Camera, TrackedSequence
 
-JAW, NECK, ROOT = 2, 1, 0
 JAW_OPEN = np.deg2rad(12)
 """Of the canonical mesh, rad."""
 N_SHAPE, N_EXPRESSION, N_TEXTURE = 300, 100, 140

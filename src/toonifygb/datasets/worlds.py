@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from toonifygb.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
+from toonifygb.head import NECK, ROOT
 from toonifygb.structures import HeadMotion
 
 if TYPE_CHECKING:
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from toonifygb.head import HeadModel
-
-ROOT, NECK = 0, 1
 
 
 def flip(like: Tensor) -> Float[Tensor, "3 3"]:

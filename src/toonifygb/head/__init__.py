@@ -5,12 +5,26 @@ from __future__ import annotations
 from functools import partial
 
 from toonifygb.errors import InputError
-from toonifygb.head.base import JOINTS, PARENTS, PARTS, HeadModel
+from toonifygb.head.base import EYE_LEFT, EYE_RIGHT, JAW, JOINTS, NECK, PARENTS, PARTS, ROOT, HeadModel
 from toonifygb.head.flame import from_arrays
 from toonifygb.head.flame_file import load_flame
 from toonifygb.head.open_head import load_open_head
 
-__all__ = ["JOINTS", "PARENTS", "PARTS", "HeadModel", "available", "from_arrays", "load", "load_open_head"]
+__all__ = [
+    "EYE_LEFT",
+    "EYE_RIGHT",
+    "JAW",
+    "JOINTS",
+    "NECK",
+    "PARENTS",
+    "PARTS",
+    "ROOT",
+    "HeadModel",
+    "available",
+    "from_arrays",
+    "load",
+    "load_open_head",
+]
 
 _LOADERS = {
     "open": load_open_head,

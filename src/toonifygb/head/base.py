@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from toonifygb.structures import HeadMotion
 
 JOINTS = ("root", "neck", "jaw", "eye_left", "eye_right")
+ROOT, NECK, JAW, EYE_LEFT, EYE_RIGHT = range(5)
+"""Places in ``JOINTS``."""
 PARENTS = (-1, 0, 1, 1, 1)
 """Parent of each of ``JOINTS``."""
 PARTS = (

@@ -10,7 +10,7 @@ import torch
 from toonifygb.errors import InputError
 from toonifygb.geometry.align import umeyama
 from toonifygb.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
-from toonifygb.head import JOINTS, PARTS
+from toonifygb.head import JAW, NECK, PARTS
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -57,11 +57,9 @@ def errors(fitted: TrackedSequence, truth: TrackedSequence, head: HeadModel) -> 
         frames = slice(first, first + CHUNK)
         ours, our_turns = face.forward(fitted.shape, fitted.motion[frames])
         true, true_turns = face.forward(truth.shape, truth.motion[frames])
-        skull = JOINTS.index("neck")
-        rotation.append(_angle_deg(our_turns[:, skull, :3, :3], true_turns[:, skull, :3, :3]))
+        rotation.append(_angle_deg(our_turns[:, NECK, :3, :3], true_turns[:, NECK, :3, :3]))
         our_jaw, true_jaw = (
-            axis_angle_to_matrix(sequence.motion.joints[frames, JOINTS.index("jaw")])
-            for sequence in (fitted, truth)
+            axis_angle_to_matrix(sequence.motion.joints[frames, JAW]) for sequence in (fitted, truth)
         )
         jaw.append(_angle_deg(our_jaw, true_jaw))
         distance.append(_aligned_distance_mm(ours, true))

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from toonifygb.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
+from toonifygb.head import EYE_LEFT, EYE_RIGHT, JAW, ROOT
 from toonifygb.structures import HeadMotion, TensorRecord
 
 if TYPE_CHECKING:
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
     from toonifygb.head import HeadModel
 
-ROOT, NECK, JAW, EYE_LEFT, EYE_RIGHT = range(5)
 HINGES = (JAW, EYE_LEFT, EYE_RIGHT)
 N_ANGLES = 2 * len(HINGES)
 N_EYELIDS = 2

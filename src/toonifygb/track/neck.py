@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from toonifygb.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
-from toonifygb.track.model import NECK, ROOT
+from toonifygb.head import NECK, ROOT
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from toonifygb.geometry import cameras
 from toonifygb.geometry.rotations import axis_angle_to_matrix
+from toonifygb.head import ROOT
 from toonifygb.structures import TensorRecord
-from toonifygb.track.model import ROOT
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

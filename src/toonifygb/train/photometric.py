@@ -19,8 +19,8 @@ import torch
 from toonifygb import render
 from toonifygb.avatar import init_avatar
 from toonifygb.avatar.fields import each, rows
-from toonifygb.avatar.model import JAW
 from toonifygb.config import TrainConfig
+from toonifygb.head import JAW
 from toonifygb.progress import SILENT
 from toonifygb.structures import HeadMotion
 from toonifygb.threads import one_torch_thread
@@ -99,16 +99,7 @@ def refine_track(
     """
     small = dataset.reduced(max(f for f in range(1, max(1, dataset.size // SIZE) + 1) if dataset.size % f == 0))
     frames = torch.tensor(sorted(small.split.train + small.split.test))
-    config = TrainConfig(
-        n_gaussians=10_000,
-        n_mouth_gaussians=1_000,
-        resolution=small.size,
-        steps=STEPS,
-        delta_frames=1,
-        dropout=0.0,
-        blendshapes="full",  # the units' own deltas are what the slopes of expressions come from
-        seed=seed,
-    )
+    config = _settings(small.size, seed)
     renderer = render.get(backend, threads)
     facts = {"fingerprint": fingerprint(config, small, sequence)}
     total = STEPS + len(PASSES) * len(frames)
@@ -155,6 +146,20 @@ def refine_track(
 
 
 _Progressed = tuple[TrainState, "TrackedSequence", "Tensor", dict[str, float]]
+
+
+def _settings(size: int, seed: int) -> TrainConfig:
+    """Those of the small avatar that frames are fitted to; crops of ``size`` px."""
+    return TrainConfig(
+        n_gaussians=10_000,
+        n_mouth_gaussians=1_000,
+        resolution=size,
+        steps=STEPS,
+        delta_frames=1,
+        dropout=0.0,
+        blendshapes="full",  # the units' own deltas are what the slopes of expressions come from
+        seed=seed,
+    )
 
 
 def _resumed(checkpoint: Path | None, wanted: dict[str, str], fitted: TrackedSequence) -> _Progressed | None:

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from toonifygb.avatar.model import JAW, NECK, ROOT
+from toonifygb.avatar.model import head_rotation
 from toonifygb.geometry.rotations import (
     axis_angle_to_matrix,
     matrix_to_axis_angle,
     matrix_to_quat,
     quat_multiply,
 )
+from toonifygb.head import JAW, NECK, ROOT
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -54,9 +55,8 @@ class Poses:
 
     @property
     def rotation(self) -> Float[Tensor, "t 3 3"]:
-        """Head to world: the root's turn, then the neck's."""
-        turns = axis_angle_to_matrix(self.sequence.motion.joints[:, : NECK + 1])
-        return turns[:, ROOT] @ turns[:, NECK]
+        """Head to world."""
+        return head_rotation(self.sequence.motion)
 
     @property
     def jaw(self) -> Float[Tensor, "t 3"]:
