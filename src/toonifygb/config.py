@@ -258,7 +258,9 @@ class RunConfig:
 WHOLE_PICTURE = 100.0
 """A ``crop_scale`` with which the largest square of the picture is taken, whatever the face's size."""
 DRAFT = TrainConfig()
-STANDARD = TrainConfig(n_gaussians=32_000, n_mouth_gaussians=4_000, resolution=512, steps=6_000)
+STANDARD = TrainConfig(
+    n_gaussians=32_000, n_mouth_gaussians=4_000, resolution=512, steps=6_000, coarse_share=0.5, dropout=0.3
+)
 PAPER = TrainConfig(
     n_gaussians=50_000,
     n_mouth_gaussians=14_000,
@@ -266,6 +268,7 @@ PAPER = TrainConfig(
     steps=40_000,
     sh_degree=3,
     coarse_share=0.5,
+    dropout=0.3,
 )
 PRESETS: dict[Quality, TrainConfig] = {"draft": DRAFT, "standard": STANDARD, "paper": PAPER}
 

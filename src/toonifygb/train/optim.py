@@ -2,7 +2,7 @@
 
 The rates are 3D Gaussian Blendshapes' (3DGB), made for 40 000 steps. A shorter training covers the same ground in
 fewer steps: what would hardly move in so few takes larger ones, delta positions and opacities in proportion,
-neutral positions with the root of it.
+neutral positions too, to a limit.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ class Optimizer:
         self._steps, self._frames = steps, frames
         stretch = max(1.0, FULL_STEPS / steps)
         delta = DELTA_RATES | {name: DELTA_RATES[name] * stretch for name in ("means", "opacity_logits")}
-        neutral = NEUTRAL_RATES | {"means": NEUTRAL_RATES["means"] * min(NEUTRAL_TRAVEL, stretch**0.5)}
+        neutral = NEUTRAL_RATES | {"means": NEUTRAL_RATES["means"] * min(NEUTRAL_TRAVEL, stretch)}
         self._neutral = _rates(state.neutral.values, neutral)
         self._expression = _rates(state.expression.values, delta)
         driver = {name: travel / steps for name, travel in DRIVER_TRAVEL.items()}
