@@ -22,6 +22,7 @@ from toonifygb.pipeline.files import LANDMARK_TRACK, open_crops
 from toonifygb.pipeline.report import Curve, Picture, Report, render_report
 from toonifygb.pipeline.stages import peak_memory_mb, write_json
 from toonifygb.pipeline.viewing import AvatarViewer, posed
+from toonifygb.progress import Part
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -67,16 +68,19 @@ def score(source: Source, run: Run, config: RunConfig, trained: str) -> str:
         sequence = track.load(run.file("track.safetensors"))
         dataset = open_crops(run, sequence)
         model, engine = avatars.load(run.file("avatar")), {"backend": config.backend, "threads": config.threads}
-        held_out = train.evaluate(model, dataset, sequence, dataset.split.test, **engine, progress=progress)
+        test, n_frames = dataset.split.test, sequence.n_frames
+        starts = (0, len(test), 2 * len(test), 2 * len(test) + n_frames)
+        parts = [Part(progress, start, starts[-1] + n_frames) for start in starts]
+        held_out = train.evaluate(model, dataset, sequence, test, **engine, progress=parts[0])
         by_landmarks = track.load(run.work(LANDMARK_TRACK))
-        driven = train.evaluate(model, dataset, by_landmarks, dataset.split.test, **engine)
+        driven = train.evaluate(model, dataset, by_landmarks, test, **engine, progress=parts[1])
         held_out |= {f"{name}_landmark_pose": driven[name] for name in ("psnr", "ssim")}
         refined_error = track.landmark_errors(sequence, head.load(sequence.head_model))
         held_out["landmark_error_refined_px"] = _mean(refined_error[sequence.error_px.isfinite()])
         styled = run.file("stylized.mp4")
-        steadiness = metrics.stability(video.read(styled))
+        steadiness = metrics.stability(parts[2].over(video.read(styled)))
         with closing(source.frames(config)) as filmed:
-            warping = stylize.warping_error(filmed, _cropped(video.read(styled), source))
+            warping = stylize.warping_error(filmed, parts[3].over(_cropped(video.read(styled), source)))
         steady = {"itf": steadiness.itf, "isi": steadiness.isi, "warping_error": warping}
         write_json(out, {**held_out, **steady})
 
