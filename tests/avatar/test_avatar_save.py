@@ -75,7 +75,7 @@ def test_compact_storage_is_small_and_hardly_differs(tmp_path: Path) -> None:
     exact, near = avatar.pose(motion), load(tmp_path / "compact").pose(motion)
     # Half precision keeps 11 bits: a 10 mm displacement is right to 5 µm. Bytes keep 7 of the largest value.
     assert (exact.means - near.means).abs().max() < 2e-5
-    step = avatar.deltas.sh.abs().max() / packing.LEVELS
+    step = avatar.deltas.sh.abs().max() / packing.REST_LEVELS
     assert (exact.sh - near.sh).abs().max() < len(avatar.blendshape_names) * step
 
 
@@ -88,9 +88,33 @@ def test_packed_deltas_are_right_to_half_a_step_and_zeros_stay_zero() -> None:
     for name in ("quats", "log_scales", "opacity_logits", "sh"):
         exact, near = getattr(sparse, name), getattr(found, name)
         step = exact.abs().amax(1, keepdim=True) / packing.LEVELS
+        if name == "sh":
+            step[..., 1:, :] *= packing.LEVELS / packing.REST_LEVELS
         assert ((exact - near).abs() <= 0.501 * step).all(), name
         assert torch.equal(near[~live], exact[~live]), name
     assert torch.equal(found.means, sparse.means.half().float())
+
+
+def test_compact_avatars_from_before_view_dependent_colour_was_apart_are_read(tmp_path: Path) -> None:
+    avatar = tiny_avatar()
+    save(avatar, tmp_path, storage="compact")
+    tensors = load_file(tmp_path / "avatar.safetensors")
+    rest = {name for name in tensors if name.startswith(f"packed.{packing.REST}.")}
+    assert len(rest) == 3
+    sh = avatar.deltas.sh.flatten(2)
+    old = packing._stepped("sh", sh, packing.LEVELS)
+    kept = {name: tensor for name, tensor in tensors.items() if name not in rest}
+    _replace_tensors(tmp_path, kept | {f"packed.{name}": tensor for name, tensor in old.items()})
+    step = sh.abs().amax(1, keepdim=True) / packing.LEVELS
+    assert ((load(tmp_path).deltas.sh.flatten(2) - sh).abs() <= 0.501 * step).all()
+
+
+def test_colour_that_is_the_same_from_everywhere_has_nothing_apart() -> None:
+    deltas = tiny_avatar().deltas
+    plain = replace(deltas, sh=deltas.sh[..., :1, :])
+    packed = packing.pack(plain)
+    assert packed[f"{packing.REST}.values"].numel() == 0
+    assert packing.unpack(packed, plain.means.shape[1]).sh.shape == plain.sh.shape
 
 
 def test_a_new_avatar_replaces_the_old(tmp_path: Path) -> None:

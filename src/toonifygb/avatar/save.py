@@ -174,7 +174,8 @@ def _assemble(tensors: dict[str, Tensor], facts: dict[str, Any], path: Path) -> 
     left_out |= set() if facts["has_drivers"] else {"drivers"}
     left_out |= set() if facts.get("has_mixer") else {"mixer"}  # avatars from before there were any do not say
     records = {name: kind for name, kind in _RECORDS.items() if name not in left_out}
-    wanted = {*_PLAIN, *_PLAIN_MOUTH, *(_PACKED + name for name in packing.names() if packed)}
+    with_rest = any(name.startswith(f"{_PACKED}{packing.REST}.") for name in tensors)
+    wanted = {*_PLAIN, *_PLAIN_MOUTH, *(_PACKED + name for name in packing.names(with_rest) if packed)}
     for name, kind in records.items():
         wanted |= {f"{name}.{p.name}" for p in fields(kind) if p.name not in {"width", "height"}}
     if wanted != set(tensors):

@@ -21,6 +21,7 @@ _DISK = {
     errno.EACCES: "permission is denied",
     errno.EPERM: "permission is denied",
 }
+_SETTINGS = "--settings"
 EXIT_STOPPED = 130
 """What a shell reports for a command ended by Ctrl-C."""
 
@@ -94,7 +95,23 @@ def _command(name: str, argv: list[str]) -> None:
 
     # Settings of a dataclass are options of the command itself: --steps, not --config.steps.
     markers = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
-    tyro.cli(COMMANDS[name], prog=f"toonifygb {name}", args=argv, config=markers)
+    tyro.cli(COMMANDS[name], prog=f"toonifygb {name}", args=_gathered(argv), config=markers)
+
+
+def _gathered(argv: list[str]) -> list[str]:
+    """The arguments with the values of every ``--settings`` after the first one: alone, the last would count."""
+    own, values, inside = [], [], False
+    for argument in argv:
+        name, equals, value = argument.partition("=")
+        if name == _SETTINGS:
+            inside = not equals
+            values += [value] if equals else []
+        elif argument.startswith("-"):
+            inside = False
+            own.append(argument)
+        else:
+            (values if inside else own).append(argument)
+    return [*own, _SETTINGS, *values] if values else argv
 
 
 def _fail(error: ToonifyError) -> int:
