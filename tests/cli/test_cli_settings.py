@@ -34,6 +34,5 @@ def test_all_settings_count(monkeypatch: pytest.MonkeyPatch, argv: list[str]) ->
 
 
 def test_the_rest_of_a_line_is_left_alone() -> None:
-    assert main._gathered(["clip.mp4", "--expression", "smile=1", "--yaw", "-25"]) == [
-        *("clip.mp4", "--expression", "smile=1", "--yaw", "-25")
-    ]
+    argv = ["clip.mp4", "--expression", "smile=1", "--yaw", "-25"]
+    assert main._gathered(argv) == argv
