@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     Plane = Float[np.ndarray, "h w"]
 
 
-_SMOOTH_RADIUS = 8
+SMOOTH_RADIUS = 8
 """Least radius, px, of a mean that is taken on a reduced image: its steps then stay invisible."""
 
 
@@ -43,9 +43,7 @@ class GuidedFilter:
     """
 
     def __init__(self, guide: Float[np.ndarray, "h w 3"], radius: int, epsilon: float, step: int = 1) -> None:
-        height, width = guide.shape[:2]
-        self._size = (width, height)
-        self._reduced = (max(1, width // step), max(1, height // step))
+        self._shape, self._step = guide.shape[:2], step
         self._radius = max(1, radius // step)
         self._guide = cv2.split(guide)
         self._colors = cv2.split(self._reduce(guide))
@@ -72,10 +70,20 @@ class GuidedFilter:
         return self._mean(self._colors[i] * self._colors[j]) - self._means[i] * self._means[j]
 
     def _reduce(self, image: Float[np.ndarray, "h w *c"]) -> Float[np.ndarray, "r s *c"]:
-        return _resized(image, self._reduced, cv2.INTER_AREA)
+        return reduced(image, self._step)
 
     def _enlarge(self, plane: Plane) -> Plane:
-        return _resized(plane, self._size, cv2.INTER_LINEAR)
+        return enlarged(plane, self._shape)
+
+
+def reduced(image: Float[np.ndarray, "h w *c"], step: int) -> Float[np.ndarray, "r s *c"]:
+    """The image at one ``step``-th of its size, by area."""
+    return _resized(image, (max(1, image.shape[1] // step), max(1, image.shape[0] // step)), cv2.INTER_AREA)
+
+
+def enlarged(plane: Float[np.ndarray, "r s"], shape: tuple[int, ...]) -> Plane:
+    """A smooth plane of a reduced image at the size (height, width) that it was reduced from."""
+    return _resized(plane, (shape[1], shape[0]), cv2.INTER_LINEAR)
 
 
 def _resized(image: np.ndarray, size: tuple[int, int], method: int) -> np.ndarray:
@@ -116,13 +124,11 @@ def foreground_color(
 
     The two wide rounds, whose means are smooth, run on a reduced image where the radius allows it.
     """
-    step = max(1, radius // 2 // _SMOOTH_RADIUS)
-    size = (image.shape[1], image.shape[0])
-    reduced = (max(1, size[0] // step), max(1, size[1] // step))
-    small = cv2.split(_resized(image, reduced, cv2.INTER_AREA))
+    step = max(1, radius // 2 // SMOOTH_RADIUS)
+    small = cv2.split(reduced(image, step))
     wide = [max(1, radius // step), max(1, radius // 2 // step)]
-    found = _unmixed(small, _resized(matte, reduced, cv2.INTER_AREA), (small, small), wide)
-    start = [[_resized(plane, size, cv2.INTER_LINEAR) for plane in planes] for planes in found]
+    found = _unmixed(small, reduced(matte, step), (small, small), wide)
+    start = [[enlarged(plane, matte.shape) for plane in planes] for planes in found]
     foregrounds, _ = _unmixed(cv2.split(image), matte, (start[0], start[1]), [max(1, radius // 8)])
     return cv2.merge(foregrounds)
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from toonifygb.face.crop import Square, as_batch, cut
-from toonifygb.face.guided import GuidedFilter, box_mean, foreground_color
+from toonifygb.face.guided import SMOOTH_RADIUS, GuidedFilter, box_mean, enlarged, foreground_color, reduced
 from toonifygb.face.networks import load_network
 
 if TYPE_CHECKING:
@@ -31,8 +31,6 @@ _CONTRAST = ((0.3, 0.7), (0.25, 0.98))
 """After each round of the guided filter, its values that become 0 and 1. It leaves a veil on both sides of an edge
 that the network drew in the wrong place; the first round's contrast corrects the place, so that the second has no
 veil left. The last lower bound also takes half a pixel off the rim, where the background's colour is strongest."""
-_LIMITS_RADIUS = 8
-"""Radius, px, down to which a matte is reduced to find what is far inside and far outside the person."""
 _ISLAND = 0.1
 """Matte below which two regions count as apart."""
 
@@ -163,14 +161,13 @@ def _limits(
     Without them, background of the hair's colour shines through and a glint inside the face becomes a hole. They
     are wide and soft, so they are found on a reduced matte: a disc over every pixel would be half of the work.
     """
-    step = max(1, radius // _LIMITS_RADIUS)
-    size = (person.shape[1], person.shape[0])
-    small = cv2.resize(person, (max(1, size[0] // step), max(1, size[1] // step)), interpolation=cv2.INTER_AREA)
+    step = max(1, radius // SMOOTH_RADIUS)
+    small = reduced(person, step)
     reach = max(1, round(radius / step))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     soften = max(1, reach // 2)
-    low = cv2.resize(box_mean(cv2.erode(small, disc), soften), size, interpolation=cv2.INTER_LINEAR)
-    high = cv2.resize(box_mean(cv2.dilate(small, disc), soften), size, interpolation=cv2.INTER_LINEAR)
+    low = enlarged(box_mean(cv2.erode(small, disc), soften), person.shape)
+    high = enlarged(box_mean(cv2.dilate(small, disc), soften), person.shape)
     return low, np.maximum(high, low)
 
 
