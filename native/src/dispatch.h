@@ -8,7 +8,7 @@ namespace tgb {
 struct Kernels {
   const char* name;
   void (*project_forward)(Frame&, const Scene&, int32_t* radii);
-  void (*composite_forward)(Frame&, const Scene&, float* color, float* alpha);
+  void (*composite_forward)(Frame&, const Scene&, float* color, float* alpha, bool keep);
   void (*composite_backward)(Frame&, const Scene&, const Gradients&);
   void (*project_backward)(Frame&, const Scene&, const Gradients&);
   void (*blend)(const float* base, const void* deltas, bool bf16, const float* psi, int k, int64_t p, float* out,

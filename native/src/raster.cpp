@@ -56,7 +56,7 @@ TGB_API tgb::Frame* tgb_raster_forward(const tgb::Scene* scene, float* color, fl
     watch.lap();
     tgb::bin_into_tiles(*frame, *scene);
     watch.lap();
-    kernels.composite_forward(*frame, *scene, color, alpha);
+    kernels.composite_forward(*frame, *scene, color, alpha, true);
     watch.lap();
     return frame;
   } catch (const std::bad_alloc&) {

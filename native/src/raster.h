@@ -49,31 +49,37 @@ struct Gradients {
 // d = p - (mx, my): the Cholesky factor of the conic, so the exponent cannot cancel or turn positive.
 struct alignas(64) Splat {
   float mx, my, ux, uy, vy, lo;
-  float slope_x, slope_y;         // x of the ridge per y (cov_xy / var_y), y of the ridge per x (cov_xy / var_x)
+  float width, tip;               // 1 / ux; y - my of the rightmost point that reaches alpha_min (with kSlack)
   float r, g, b;
-  int32_t id;                     // index in the input
-  uint16_t x0, y0, x1, y1;        // blocks of the image it may touch: [x0, x1) x [y0, y1)
-  float depth;
   float place;                    // in the list of the tile at work
+  float x0, y0, x1, y1;           // blocks of the image it may touch: [x0, x1) x [y0, y1)
 };
 static_assert(sizeof(Splat) == 64, "one cache line");
+
+// Screen tiles [x0, x1) x [y0, y1) of a splat.
+struct TileRect {
+  uint16_t x0, x1, y0, y1;
+};
 
 // Everything one rendered image leaves behind for its backward pass, and the workspace of both.
 struct Frame {
   int visible = 0, tiles_x = 0, tiles_y = 0;
   uint32_t pairs = 0;                          // (Gaussian, tile) pairs
-  Buffer<Splat> records, sorted;               // by input index; by depth
-  Buffer<uint8_t> drawn, clamped;              // by input index: is it in `sorted`; colour channels clamped at 0 (bits)
+  Buffer<Splat> records;                       // by input index, like the four below; of those that are drawn
+  Buffer<TileRect> tiles;                      // of the record: ordering reads only these and
+  Buffer<float> depth;
+  Buffer<uint8_t> drawn, clamped;              // is it drawn at all; colour channels clamped at 0 (bits)
   Buffer<int32_t> visible_before;              // per chunk of Gaussians
-  Buffer<uint32_t> key, key_swap, order, order_swap;
+  Buffer<uint64_t> order, order_swap;          // front to back: input index | bits of the depth << 32
   Buffer<uint32_t> slot_begin;                 // by input index: its first gradient slot
   Buffer<uint32_t> tile_begin, tile_used, histogram;
-  Buffer<uint64_t> list;                       // per pair, tile by tile, front to back: depth rank | slot << 32
+  Buffer<uint64_t> list;                       // per pair, tile by tile, front to back: input index | slot << 32
   Buffer<uint64_t> masks;                      // per pair: blocks touched while alive
   Buffer<float> transmittance, last;           // per pixel, block-major: final T; list index of the last contribution
   Buffer<float> slots;
 };
 
+constexpr float kSlack = 1e-3f;                // in log2(alpha): block masks may be too large by this, never too small
 constexpr int kChunk = 1024;                   // Gaussians per task
 inline int chunks(int n) { return (n + kChunk - 1) / kChunk; }
 

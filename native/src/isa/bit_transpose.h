@@ -1,4 +1,4 @@
-// 64 x 64 bit-matrix transpose by swapping ever smaller off-diagonal blocks.
+// Words of bits, in plain C++.
 #pragma once
 #include <cstdint>
 #include <cstring>
@@ -6,7 +6,7 @@
 namespace tgb {
 namespace TGB_ISA {
 
-// columns[b] bit j = rows[j] bit b
+// columns[b] bit j = rows[j] bit b, by swapping ever smaller off-diagonal squares.
 static inline void transpose_bits(const uint64_t* rows, uint64_t* columns) {
   memcpy(columns, rows, 64 * sizeof(uint64_t));
   uint64_t mask = 0x00000000FFFFFFFFull;
@@ -17,6 +17,13 @@ static inline void transpose_bits(const uint64_t* rows, uint64_t* columns) {
       columns[row | size] ^= swapped;
     }
   }
+}
+
+// Writes `first` plus the numbers of the set bits, lowest first, to `out`, which has room for 64; returns how many.
+static inline int list_bits(uint64_t word, int first, uint32_t* out) {
+  int count = 0;
+  for (; word != 0; word &= word - 1) out[count++] = static_cast<uint32_t>(first + __builtin_ctzll(word));
+  return count;
 }
 
 }  // namespace TGB_ISA

@@ -6,15 +6,12 @@
 namespace tgb {
 namespace TGB_ISA {
 
-// Pixel centres of the blocks in each column and row of a tile, and each block's first pixel, relative to the tile.
+// Pixel centres of the blocks in each column and row of a tile, relative to the tile.
 // Small on purpose: it lives in the L1 cache beside a tile's pixels. A constant expression: code run at load time must
 // not use an instruction set the machine may lack.
 struct BlockTable {
-  alignas(64) float x[kBlocksAcross][kLanes], y[kBlocksAcross][kLanes], left[kBlocks], top[kBlocks];
-  constexpr BlockTable() : x{}, y{}, left{}, top{} {
-    for (int b = 0; b < kBlocks; b++) {
-      left[b] = static_cast<float>(b % kBlocksAcross * kBlock), top[b] = static_cast<float>(b / kBlocksAcross * kBlock);
-    }
+  alignas(64) float x[kBlocksAcross][kLanes], y[kBlocksAcross][kLanes];
+  constexpr BlockTable() : x{}, y{} {
     for (int i = 0; i < kBlocksAcross; i++)
       for (int l = 0; l < kLanes; l++)
         x[i][l] = static_cast<float>(i * kBlock + l % kBlock), y[i][l] = static_cast<float>(i * kBlock + l / kBlock);
@@ -37,41 +34,44 @@ struct TileView {
   }
 };
 
-// Blocks of the tile at (left, top) px that lie in the splat's block rectangle.
-static inline uint64_t rectangle_mask(const Splat& s, int left, int top) {
-  const int bx = left / kBlock, by = top / kBlock;
-  const int x0 = imax(s.x0 - bx, 0), x1 = imin(s.x1 - bx, kBlocksAcross);
-  const int y0 = imax(s.y0 - by, 0), y1 = imin(s.y1 - by, kBlocksAcross);
-  const uint64_t row = ((1u << x1) - 1) & ~((1u << x0) - 1);
-  const uint64_t rows_below = y1 == kBlocksAcross ? ~0ull : (1ull << (8 * y1)) - 1;
-  return row * 0x0101010101010101ull & rows_below & ~((1ull << (8 * y0)) - 1);
-}
-
 // Four neighbouring pixels of one row of a block, as they stand in an image row.
 static inline void copy_quad(float* to, const float* from) { memcpy(to, from, kBlock * sizeof(float)); }
 
-constexpr uint64_t kGroup = (1ull << kWidth) - 1;
+// Square root, fast; of 1e-20 for less.
+static inline F root(F a) {
+  a = vmax(a, F(1e-20f));
+  return a * reciprocal_root(a);
+}
 
-// Blocks whose rectangle of pixel centres the ellipse {log2 alpha >= threshold} reaches, exactly up to rounding. The
-// exponent is concave, so its largest value over a rectangle is at the point nearest the mean along x (then the best
-// y there) or along y (then the best x). `s` has its mean relative to the tile.
-//
-// Blocks outside `within` are not looked for. Narrow vectors skip groups without any; for 16 lanes a mispredicted
-// branch costs more than the test.
-static inline uint64_t ellipse_mask(const Splat& s, float threshold, uint64_t within) {
-  const F ux(s.ux), uy(s.uy), vy(s.vy), lo(s.lo), zero(0.f), extent(kBlock - 1.f), limit(threshold - 1e-3f);
-  uint64_t mask = 0;
-  for (int b = 0; b < kBlocks; b += kWidth) {
-    if (kWidth < 16 && (within >> b & kGroup) == 0) continue;
-    const F x0 = load(kBlockTable.left + b) - F(s.mx), y0 = load(kBlockTable.top + b) - F(s.my);
-    const F x1 = x0 + extent, y1 = y0 + extent;
-    const F near_x = clamp(zero, x0, x1), near_y = clamp(zero, y0, y1);
-    const F best_y = clamp(F(s.slope_y) * near_x, y0, y1), best_x = clamp(F(s.slope_x) * near_y, x0, x1);
-    const F u1 = fma(ux, near_x, uy * best_y), v1 = vy * best_y, u2 = fma(ux, best_x, uy * near_y), v2 = vy * near_y;
-    const F p1 = fnma(v1, v1, fnma(u1, u1, lo)), p2 = fnma(v2, v2, fnma(u2, u2, lo));
-    mask |= static_cast<uint64_t>(bits(ge(vmax(p1, p2), limit))) << b;
+// For kWidth splats with means relative to the tile: the blocks of the tile that each one's rectangle holds and its
+// ellipse {u^2 + v^2 <= L} reaches, exactly up to kSlack: L is lo - threshold + kSlack. Row by row of the tile: the
+// part of the ellipse between the first and the last pixel row of a block row is convex; its leftmost and rightmost
+// points are those of the whole ellipse where they are in there, else on the edge nearer to them.
+static inline void block_masks(const Splat* splats, const TileView& view, float threshold, uint64_t* masks) {
+  constexpr int kStride = sizeof(Splat) / sizeof(float);
+  const auto field = [&](float Splat::*member) { return load_strided<kStride>(&(splats->*member)); };
+  const F mx = field(&Splat::mx), my = field(&Splat::my), vy = field(&Splat::vy), width = field(&Splat::width);
+  const F tip = field(&Splat::tip), lean = field(&Splat::uy) * width;
+  const F reach = field(&Splat::lo) + F(kSlack - threshold), zero(0.f), one(1.f), quarter(1.f / kBlock);
+  const F left_block(static_cast<float>(view.left / kBlock)), top_block(static_cast<float>(view.top / kBlock));
+  const F columns(static_cast<float>(kBlocksAcross));
+  const F x0 = clamp(field(&Splat::x0) - left_block, zero, columns), x1 = clamp(field(&Splat::x1) - left_block, zero, columns);
+  const F y0 = field(&Splat::y0) - top_block, y1 = field(&Splat::y1) - top_block;
+  F rows[kBlocksAcross];
+  for (int row = 0; row < kBlocksAcross; row++) {
+    const F top = F(static_cast<float>(row * kBlock)) - my, bottom = top + F(kBlock - 1.f), number(static_cast<float>(row));
+    const F left_y = clamp(-tip, top, bottom), right_y = clamp(tip, top, bottom);
+    const F left_v = vy * left_y, right_v = vy * right_y;
+    const F left_rest = fnma(left_v, left_v, reach), right_rest = fnma(right_v, right_v, reach);
+    const F left = fnma(width, root(left_rest), fnma(lean, left_y, mx));
+    const F right = fma(width, root(right_rest), fnma(lean, right_y, mx));
+    const F first = clamp(vceil((left - F(kBlock - 1.f)) * quarter), x0, x1);
+    const F end = clamp(one - vceil(-(right * quarter)), x0, x1);
+    const M inside = both(both(ge(left_rest, zero), ge(right_rest, zero)), both(ge(number, y0), gt(y1, number)));
+    // 2^end - 2^first: the bits between
+    rows[row] = keep(inside, vmax(zero, scale_by_power(one, end) - scale_by_power(one, first)));
   }
-  return mask & within;
+  join_bytes(rows, masks);
 }
 
 }  // namespace TGB_ISA

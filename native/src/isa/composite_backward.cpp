@@ -87,7 +87,7 @@ void composite_tile_backward(Frame& frame, const Scene& scene, const Gradients& 
   const auto slot = [&](uint32_t e) { return frame.slots.data() + (frame.list[e] >> 32) * kSlot; };
   for (uint32_t e = used; e-- > begin;) {
     if (e >= begin + 6) {
-      __builtin_prefetch(&frame.sorted[static_cast<uint32_t>(frame.list[e - 6])]);
+      __builtin_prefetch(&frame.records[static_cast<uint32_t>(frame.list[e - 6])]);
       __builtin_prefetch(slot(e - 6), 1);
     }
     float* out = slot(e);
@@ -95,7 +95,7 @@ void composite_tile_backward(Frame& frame, const Scene& scene, const Gradients& 
       memset(out, 0, kSlot * sizeof(float));
       continue;
     }
-    const Splat& s = frame.sorted[static_cast<uint32_t>(frame.list[e])];
+    const Splat& s = frame.records[static_cast<uint32_t>(frame.list[e])];
     const F mx(s.mx - view.left), my(s.my - view.top), index(static_cast<float>(e - begin));
     Sums sums;
     for (uint64_t rest = frame.masks[e]; rest != 0; rest &= rest - 1) {

@@ -10,7 +10,7 @@ namespace tgb {
 namespace TGB_ISA {
 
 void project_forward(Frame& frame, const Scene& scene, int32_t* radii);
-void composite_forward(Frame& frame, const Scene& scene, float* color, float* alpha);
+void composite_forward(Frame& frame, const Scene& scene, float* color, float* alpha, bool keep);
 void composite_backward(Frame& frame, const Scene& scene, const Gradients& gradients);
 void project_backward(Frame& frame, const Scene& scene, const Gradients& gradients);
 

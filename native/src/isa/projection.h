@@ -59,12 +59,8 @@ static inline void project_centre(const View& view, Projection& p) {
   p.J11 = F(view.fy) * p.inverse_z, p.J12 = -(F(view.fy) * clamped_y * p.inverse_z);
 }
 
-// Reads `count` Gaussians from index `i` on and projects centre and covariance.
-static inline void project(const View& view, const Scene& scene, int i, int count, Projection& p) {
-  const Splats& splats = scene.splats;
-  load_structs<3>(splats.means + 3 * static_cast<size_t>(i), count, p.mean);
-  load_structs<4>(splats.quats + 4 * static_cast<size_t>(i), count, p.q);
-  load_structs<3>(splats.scales + 3 * static_cast<size_t>(i), count, p.scale);
+// Projects centre and covariance of the inputs in `p`.
+static inline void project(const View& view, const Scene& scene, Projection& p) {
   project_centre(view, p);
   quaternion_matrix(p.q, p.Rq);
   for (int r = 0; r < 3; r++)
@@ -86,21 +82,35 @@ static inline void project(const View& view, const Scene& scene, int i, int coun
   p.det = fma(m0, m0, fma(m1, m1, fma(m2, m2, low_pass * (a0 + c0 + low_pass))));
 }
 
+// Reads `count` Gaussians from index `i` on and projects them.
+static inline void project(const View& view, const Scene& scene, int i, int count, Projection& p) {
+  const Splats& splats = scene.splats;
+  load_structs<3>(splats.means + 3 * static_cast<size_t>(i), count, p.mean);
+  load_structs<4>(splats.quats + 4 * static_cast<size_t>(i), count, p.q);
+  load_structs<3>(splats.scales + 3 * static_cast<size_t>(i), count, p.scale);
+  project(view, scene, p);
+}
+
 // Unit direction from the camera to each Gaussian, and in the frame of its harmonics (R^T d) where it has one.
 struct Directions {
   F world[3], local[3], inverse_length;
 };
 
-static inline void view_directions(const View& view, const Splats& splats, const Projection& p, int i, int count,
-                                   Directions& d) {
+// `R`: those frames, or null.
+static inline void view_directions(const View& view, const Projection& p, const F* R, Directions& d) {
   for (int k = 0; k < 3; k++) d.world[k] = p.mean[k] - F(view.position[k]);
   const F* w = d.world;
   d.inverse_length = F(1.f) / vsqrt(fma(w[0], w[0], fma(w[1], w[1], w[2] * w[2])));
   for (int k = 0; k < 3; k++) d.world[k] = d.local[k] = d.world[k] * d.inverse_length;
-  if (splats.sh_frames == nullptr) return;
-  F R[9];
-  load_structs<9>(splats.sh_frames + 9 * static_cast<size_t>(i), count, R);
+  if (R == nullptr) return;
   for (int k = 0; k < 3; k++) d.local[k] = fma(R[k], w[0], fma(R[3 + k], w[1], R[6 + k] * w[2]));
+}
+
+static inline void view_directions(const View& view, const Splats& splats, const Projection& p, int i, int count,
+                                   Directions& d) {
+  F R[9];
+  if (splats.sh_frames != nullptr) load_structs<9>(splats.sh_frames + 9 * static_cast<size_t>(i), count, R);
+  view_directions(view, p, splats.sh_frames == nullptr ? nullptr : R, d);
 }
 
 }  // namespace TGB_ISA

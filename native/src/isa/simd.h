@@ -35,9 +35,25 @@ static inline F exp2(F x) {
   return scale_by_power(fma(fma(a, f2, b), f2, c), n);
 }
 
+// log2(x) for x > 0 with an absolute error below 2e-7: the exponent, and the artanh series of the rest,
+// moved to [sqrt(1/2), sqrt(2)].
+static inline F log2(F x) {
+  F exponent, m;
+  split_exponent(x, exponent, m);  // x = m 2^exponent, m in [1, 2)
+  const M high = gt(m, F(1.41421356f));
+  m = select(high, m * F(0.5f), m), exponent = select(high, exponent + F(1.f), exponent);
+  const F t = (m - F(1.f)) / (m + F(1.f)), t2 = t * t;
+  const F series = fma(fma(fma(fma(F(1.f / 9), t2, F(1.f / 7)), t2, F(1.f / 5)), t2, F(1.f / 3)), t2, F(1.f));
+  return fma(t * F(2.8853900817779268f), series, exponent);
+}
+
 // Array of structs of S floats, `count` <= kWidth items (the last one repeated), to S vectors.
 template <int S>
 static inline void load_structs(const float* p, int count, F* out) {
+  if (count == kWidth) {
+    for (int s = 0; s < S; s++) out[s] = load_strided<S>(p + s);
+    return;
+  }
   alignas(64) float t[S][kWidth];
   for (int i = 0; i < kWidth; i++)
     for (int s = 0; s < S; s++) t[s][i] = p[imin(i, count - 1) * S + s];

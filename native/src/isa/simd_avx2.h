@@ -50,6 +50,22 @@ static inline F scale_by_power(F a, F n) {  // a 2^n, n integral
   const __m256i shifted = _mm256_slli_epi32(_mm256_cvtps_epi32(n.v), 23);
   return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(a.v), shifted));
 }
+static inline void split_exponent(F x, F& exponent, F& mantissa) {  // normal x > 0: mantissa 2^exponent, in [1, 2)
+  const __m256i word = _mm256_castps_si256(x.v);
+  exponent = _mm256_cvtepi32_ps(_mm256_sub_epi32(_mm256_srli_epi32(word, 23), _mm256_set1_epi32(127)));
+  mantissa = _mm256_castsi256_ps(
+      _mm256_or_si256(_mm256_and_si256(word, _mm256_set1_epi32(0x7fffff)), _mm256_set1_epi32(0x3f800000)));
+}
+static inline F load_level(const int8_t* p) {
+  return _mm256_cvtepi32_ps(_mm256_cvtepi8_epi32(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(p))));
+}
+static inline F load_level(const int16_t* p) {
+  return _mm256_cvtepi32_ps(_mm256_cvtepi16_epi32(_mm_loadu_si128(reinterpret_cast<const __m128i*>(p))));
+}
+static inline F go_on(M go, F next, F T) {  // T goes on as `next`, or stops: its sign then says so
+  return _mm256_blendv_ps(_mm256_or_ps(T.v, _mm256_set1_ps(-0.f)), next.v, go.v);
+}
+static inline F magnitude(F a) { return _mm256_andnot_ps(_mm256_set1_ps(-0.f), a.v); }
 static inline F reciprocal(F a) {  // one Newton step on the estimate: relative error 2e-7
   const __m256 r = _mm256_rcp_ps(a.v);
   return _mm256_mul_ps(r, _mm256_fnmadd_ps(a.v, r, _mm256_set1_ps(2.f)));
@@ -66,6 +82,21 @@ static inline void sum4(float* out, F a, F b, F c, F d) {
   const __m256d hi = _mm256_unpackhi_pd(_mm256_castps_pd(ab), _mm256_castps_pd(cd));
   const __m256 x = _mm256_add_ps(_mm256_castpd_ps(lo), _mm256_castpd_ps(hi));
   _mm_storeu_ps(out, _mm_add_ps(_mm256_castps256_ps128(x), _mm256_extractf128_ps(x, 1)));
+}
+// out[lane] = the lane of eight vectors of whole numbers 0..255 as bytes, rows[0] lowest.
+static inline void join_bytes(const F* rows, uint64_t* out) {
+  alignas(32) float lanes[kWidth];
+  memset(out, 0, kWidth * sizeof(uint64_t));
+  for (int r = 0; r < 8; r++) {
+    store(lanes, rows[r]);
+    for (int i = 0; i < kWidth; i++) out[i] |= static_cast<uint64_t>(lanes[i]) << (8 * r);
+  }
+}
+// p[0], p[S], p[2 S] ...
+template <int S>
+static inline F load_strided(const float* p) {
+  const __m256i lane = _mm256_set_epi32(7, 6, 5, 4, 3, 2, 1, 0);
+  return _mm256_i32gather_ps(p, _mm256_mullo_epi32(lane, _mm256_set1_epi32(S)), 4);
 }
 static inline F load_bf16(const uint16_t* p) {
   const __m128i half = _mm_loadu_si128(reinterpret_cast<const __m128i*>(p));

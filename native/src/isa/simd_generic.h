@@ -68,11 +68,36 @@ static inline F exp2_split(F x, F& fraction) {
 static inline F scale_by_power(F a, F n) {  // a 2^n, n integral
   return (v4f)((v4i)a.v + (__builtin_convertvector(n.v, v4i) << 23));
 }
+static inline void split_exponent(F x, F& exponent, F& mantissa) {  // normal x > 0: mantissa 2^exponent, in [1, 2)
+  const v4i word = (v4i)x.v;
+  exponent = __builtin_convertvector((word >> 23) - 127, v4f);
+  mantissa = (v4f)((word & 0x7fffff) | 0x3f800000);
+}
+template <class Level>
+static inline F load_level(const Level* p) {
+  return __builtin_convertvector((v4i{p[0], p[1], p[2], p[3]}), v4f);
+}
+static inline F magnitude(F a) { return (v4f)((v4i)a.v & 0x7fffffff); }
+static inline F go_on(M go, F next, F T) { return select(go, next, -magnitude(T).v); }  // T goes on, or stops: negative
 static inline F reciprocal(F a) { return F(1.f) / a; }
 static inline F reciprocal_root(F a) { return F(1.f) / vsqrt(a); }
 static inline float sum(F a) { return (a.v[0] + a.v[1]) + (a.v[2] + a.v[3]); }
 static inline void sum4(float* out, F a, F b, F c, F d) {
   out[0] = sum(a), out[1] = sum(b), out[2] = sum(c), out[3] = sum(d);
+}
+// out[lane] = the lane of eight vectors of whole numbers 0..255 as bytes, rows[0] lowest.
+static inline void join_bytes(const F* rows, uint64_t* out) {
+  alignas(32) float lanes[kWidth];
+  memset(out, 0, kWidth * sizeof(uint64_t));
+  for (int r = 0; r < 8; r++) {
+    store(lanes, rows[r]);
+    for (int i = 0; i < kWidth; i++) out[i] |= static_cast<uint64_t>(lanes[i]) << (8 * r);
+  }
+}
+// p[0], p[S], p[2 S] ...
+template <int S>
+static inline F load_strided(const float* p) {
+  return v4f{p[0], p[S], p[2 * S], p[3 * S]};
 }
 static inline F load_bf16(const uint16_t* p) {
   return (v4f)(v4i{p[0] << 16, p[1] << 16, p[2] << 16, p[3] << 16});
