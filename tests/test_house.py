@@ -355,3 +355,10 @@ def test_help_needs_no_tty_and_exits_with_zero():
         [sys.executable, "-m", "toonifygb.cli.main", "--help"], capture_output=True, text=True, check=False, env=env
     )
     assert result.returncode == 0 and "toonifygb" in result.stdout and result.stderr == ""
+
+
+def test_code_compiled_per_instruction_set_names_nothing_of_the_standard_library() -> None:
+    """The linker would merge its templates across instruction sets, and might keep one the machine lacks."""
+    sources = sorted((ROOT / "native" / "src" / "isa").iterdir())
+    assert len(sources) > 10
+    assert [path.name for path in sources if "std::" in path.read_text()] == []

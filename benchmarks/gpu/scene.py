@@ -64,8 +64,16 @@ def sequence(model: HeadModel, n_frames: int, size: int) -> TrackedSequence:
     )
 
 
-def avatar(n_face: int, n_mouth: int, degree: int, size: int) -> Avatar:
-    """An avatar on the open head with so many Gaussians, opacities as training leaves them, small random deltas."""
+def avatar(n_face: int, n_mouth: int, degree: int, size: int, *, local: bool = False) -> Avatar:
+    """An avatar on the open head with so many Gaussians, opacities as training leaves them, small random deltas.
+
+    Args:
+        n_face: Gaussians of the face.
+        n_mouth: Gaussians of the mouth.
+        degree: of its view-dependent colour.
+        size: of the image that it is placed for, px.
+        local: deltas only where an expression moves the surface, as in training.
+    """
     model = head.load("open")
     config = TrainConfig(
         n_gaussians=n_face // COPIES, n_mouth_gaussians=n_mouth // COPIES, resolution=size, sh_degree=degree
@@ -87,8 +95,11 @@ def avatar(n_face: int, n_mouth: int, degree: int, size: int) -> Avatar:
         )
 
     deltas = first.deltas.map(repeated(1))
+    live = (deltas.means != 0).any(-1) if local else torch.ones(deltas.means.shape[:2], dtype=torch.bool)
+    live[first.n_bases :] = True
     for _, delta in each(deltas):
-        delta.add_(torch.randn(delta.shape, generator=random), alpha=1e-3)
+        noise = torch.randn(delta.shape, generator=random)
+        delta.add_(noise * live.view(*live.shape, *[1] * (delta.ndim - 2)), alpha=1e-3)
     return replace(
         first,
         neutral=spread(first.neutral),

@@ -1,5 +1,6 @@
 // Choice of the instruction set at run time.
 #pragma once
+#include "playback.h"
 #include "raster.h"
 #include "training.h"
 
@@ -8,6 +9,7 @@ namespace tgb {
 struct Kernels {
   const char* name;
   void (*project_forward)(Frame&, const Scene&, int32_t* radii);
+  void (*project_playback)(Frame&, const Scene&, const Playback&, const float* psi, const float* transforms);
   void (*composite_forward)(Frame&, const Scene&, float* color, float* alpha, bool keep);
   void (*composite_backward)(Frame&, const Scene&, const Gradients&);
   void (*project_backward)(Frame&, const Scene&, const Gradients&);

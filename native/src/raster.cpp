@@ -22,6 +22,11 @@ tgb::Frame* take_frame() {
   return frame;
 }
 
+void give_frame(tgb::Frame* frame) {
+  std::lock_guard<std::mutex> lock(frames_mutex);
+  free_frames.push_back(frame);
+}
+
 // Processor time of the whole process: on a shared machine the only time that repeats.
 class Stopwatch {
  public:
@@ -38,6 +43,29 @@ class Stopwatch {
   std::clock_t start_;
 };
 
+// The four stages, the first by `project(frame)`. Null when out of memory.
+template <class Project>
+tgb::Frame* make_frame(const tgb::Scene& scene, float* color, float* alpha, bool keep, double* seconds,
+                       const Project& project) {
+  tgb::Frame* frame = nullptr;
+  try {
+    frame = take_frame();
+    Stopwatch watch(seconds);
+    project(*frame);
+    watch.lap();
+    tgb::sort_by_depth(*frame, scene);
+    watch.lap();
+    tgb::bin_into_tiles(*frame, scene, keep);
+    watch.lap();
+    tgb::kernels().composite_forward(*frame, scene, color, alpha, keep);
+    watch.lap();
+    return frame;
+  } catch (const std::bad_alloc&) {
+    delete frame;
+    return nullptr;
+  }
+}
+
 }  // namespace
 
 // Renders `scene` to color [h, w, 3] and alpha [h, w]. `radii` [n] (px, 0 where not visible) and `seconds` [4] (processor
@@ -45,24 +73,21 @@ class Stopwatch {
 // hand it back with tgb_raster_release.
 TGB_API tgb::Frame* tgb_raster_forward(const tgb::Scene* scene, float* color, float* alpha, int32_t* radii,
                                        double* seconds) {
-  tgb::Frame* frame = nullptr;
-  try {
-    frame = take_frame();
-    const tgb::Kernels& kernels = tgb::kernels();
-    Stopwatch watch(seconds);
-    kernels.project_forward(*frame, *scene, radii);
-    watch.lap();
-    tgb::sort_by_depth(*frame, *scene);
-    watch.lap();
-    tgb::bin_into_tiles(*frame, *scene);
-    watch.lap();
-    kernels.composite_forward(*frame, *scene, color, alpha, true);
-    watch.lap();
-    return frame;
-  } catch (const std::bad_alloc&) {
-    delete frame;
-    return nullptr;
-  }
+  return make_frame(*scene, color, alpha, true, seconds,
+                    [&](tgb::Frame& frame) { tgb::kernels().project_forward(frame, *scene, radii); });
+}
+
+// Renders one frame of an avatar: `psi` [rows], `transforms` [kJoints, 4, 4]; the scene's splats but for sh_degree are
+// not looked at. The rest as above. Returns 0 when out of memory.
+TGB_API int tgb_play(const tgb::Playback* avatar, const float* psi, const float* transforms, const tgb::Scene* scene,
+                     float* color, float* alpha, double* seconds) {
+  tgb::Scene view = *scene;
+  view.splats.n = avatar->n;
+  tgb::Frame* frame = make_frame(view, color, alpha, false, seconds, [&](tgb::Frame& made) {
+    tgb::kernels().project_playback(made, view, *avatar, psi, transforms);
+  });
+  if (frame != nullptr) give_frame(frame);
+  return frame != nullptr;
 }
 
 // Gradients of the image that tgb_raster_forward made from the same scene. `seconds` [2] (composite, project) may be
@@ -82,10 +107,7 @@ TGB_API int tgb_raster_backward(tgb::Frame* frame, const tgb::Scene* scene, cons
   }
 }
 
-TGB_API void tgb_raster_release(tgb::Frame* frame) {
-  std::lock_guard<std::mutex> lock(frames_mutex);
-  free_frames.push_back(frame);
-}
+TGB_API void tgb_raster_release(tgb::Frame* frame) { give_frame(frame); }
 
 // Sizes of a frame: visible Gaussians, (Gaussian, tile) pairs, tiles, and 4 x 4 px blocks composited over all pairs.
 TGB_API void tgb_raster_counts(const tgb::Frame* frame, int32_t* counts) {

@@ -54,19 +54,15 @@ struct alignas(64) Splat {
   float place;                    // in the list of the tile at work
   float x0, y0, x1, y1;           // blocks of the image it may touch: [x0, x1) x [y0, y1)
 };
-static_assert(sizeof(Splat) == 64, "one cache line");
-
-// Screen tiles [x0, x1) x [y0, y1) of a splat.
-struct TileRect {
-  uint16_t x0, x1, y0, y1;
-};
+constexpr int kSplatFloats = 16;
+static_assert(sizeof(Splat) == kSplatFloats * sizeof(float), "one cache line");
 
 // Everything one rendered image leaves behind for its backward pass, and the workspace of both.
 struct Frame {
   int visible = 0, tiles_x = 0, tiles_y = 0;
   uint32_t pairs = 0;                          // (Gaussian, tile) pairs
   Buffer<Splat> records;                       // by input index, like the four below; of those that are drawn
-  Buffer<TileRect> tiles;                      // of the record: ordering reads only these and
+  Buffer<int32_t> tile_columns, tile_rows;     // see TileRect: ordering reads only these and
   Buffer<float> depth;
   Buffer<uint8_t> drawn, clamped;              // is it drawn at all; colour channels clamped at 0 (bits)
   Buffer<int32_t> visible_before;              // per chunk of Gaussians
@@ -77,6 +73,18 @@ struct Frame {
   Buffer<uint64_t> masks;                      // per pair: blocks touched while alive
   Buffer<float> transmittance, last;           // per pixel, block-major: final T; list index of the last contribution
   Buffer<float> slots;
+  Buffer<float> factors;                       // of playback: psi times step, [channel, row]
+};
+
+// Screen tiles [x0, x1) x [y0, y1) of a record. A range is one number below 2^24, so that floats can count it.
+struct TileRect {
+  static constexpr int kBits = 12;
+  int x0, x1, y0, y1;
+  TileRect(const Frame& frame, uint32_t i)
+      : x0(frame.tile_columns[i] & ((1 << kBits) - 1)),
+        x1(frame.tile_columns[i] >> kBits),
+        y0(frame.tile_rows[i] & ((1 << kBits) - 1)),
+        y1(frame.tile_rows[i] >> kBits) {}
 };
 
 constexpr float kSlack = 1e-3f;                // in log2(alpha): block masks may be too large by this, never too small
@@ -85,6 +93,6 @@ inline int chunks(int n) { return (n + kChunk - 1) / kChunk; }
 
 // Stages that need no vector code (raster_order.cpp).
 void sort_by_depth(Frame& frame, const Scene& scene);
-void bin_into_tiles(Frame& frame, const Scene& scene);
+void bin_into_tiles(Frame& frame, const Scene& scene, bool keep);  // keep: for a backward pass
 
 }  // namespace tgb

@@ -8,7 +8,11 @@
 namespace tgb {
 namespace {
 
-constexpr int kDigitBits = 12, kDigits = 1 << kDigitBits, kPasses = 3;
+constexpr int kDigitBits = 12, kDigits = 1 << kDigitBits;
+constexpr int kAhead = 16;  // entries fetched ahead: they point everywhere
+
+// Elements of a thread's part of `count`.
+inline int first_of(int part, int parts, int count) { return static_cast<int>(static_cast<int64_t>(count) * part / parts); }
 
 // The drawn Gaussians in input order. Positive floats order like their bits.
 void collect(Frame& frame, const Scene& scene) {
@@ -31,10 +35,10 @@ void place_slots(Frame& frame, const Scene& scene) {
   for (int i = 0; i < scene.splats.n; i++) {
     frame.slot_begin[i] = total;
     if (!frame.drawn[i]) continue;
-    const TileRect rect = frame.tiles[i];
+    const TileRect rect(frame, i);
     total += static_cast<uint32_t>((rect.x1 - rect.x0) * (rect.y1 - rect.y0));
   }
-  frame.slot_begin[scene.splats.n] = frame.pairs = total;
+  frame.slot_begin[scene.splats.n] = total;
 }
 
 }  // namespace
@@ -54,18 +58,28 @@ void sort_by_depth(Frame& frame, const Scene& scene) {
     const uint32_t key = static_cast<uint32_t>(frame.order[i] >> 32);
     least = key < least ? key : least, most = key > most ? key : most;
   }
-  const auto digit = [&](uint64_t entry, int pass) {
-    return (static_cast<uint32_t>(entry >> 32) - least) >> (kDigitBits * pass) & (kDigits - 1);
-  };
-  uint32_t counts[kPasses][kDigits] = {};
-  for (int i = 0; i < visible; i++)
-    for (int pass = 0; pass < kPasses; pass++) counts[pass][digit(frame.order[i], pass)]++;
-  for (int pass = 0; pass < kPasses && visible != 0; pass++) {
-    if ((most - least) >> (kDigitBits * pass) == 0) break;
-    uint32_t* position = counts[pass];
+  const int parts = scene.threads;
+  frame.histogram.need(static_cast<size_t>(parts) * kDigits);
+  for (int shift = 0; visible != 0 && shift < 32 && (most - least) >> shift != 0; shift += kDigitBits) {
+    const auto digit = [&](uint64_t entry) {
+      return (static_cast<uint32_t>(entry >> 32) - least) >> shift & (kDigits - 1);
+    };
+    const auto counts = [&](int part) { return frame.histogram.data() + static_cast<size_t>(part) * kDigits; };
+    parallel_for(parts, parts, [&](int part) {
+      uint32_t* count = counts(part);
+      memset(count, 0, sizeof(uint32_t) * kDigits);
+      const int end = first_of(part + 1, parts, visible);
+      for (int i = first_of(part, parts, visible); i < end; i++) count[digit(frame.order[i])]++;
+    });
     uint32_t sum = 0;
-    for (int d = 0; d < kDigits; d++) sum += std::exchange(position[d], sum);
-    for (int i = 0; i < visible; i++) frame.order_swap[position[digit(frame.order[i], pass)]++] = frame.order[i];
+    for (int d = 0; d < kDigits; d++)
+      for (int part = 0; part < parts; part++) sum += std::exchange(counts(part)[d], sum);
+    parallel_for(parts, parts, [&](int part) {
+      uint32_t* position = counts(part);
+      const int end = first_of(part + 1, parts, visible);
+      for (int i = first_of(part, parts, visible); i < end; i++)
+        frame.order_swap[position[digit(frame.order[i])]++] = frame.order[i];
+    });
     frame.order.swap(frame.order_swap);
   }
 }
@@ -73,22 +87,26 @@ void sort_by_depth(Frame& frame, const Scene& scene) {
 // Counting sort by tile: each thread counts and then scatters its own stretch of the depth order, so lists come out
 // front to back without sorting (tile, depth) keys. Both without branches that depend on a splat's size, for most
 // splats: nobody can predict those.
-void bin_into_tiles(Frame& frame, const Scene& scene) {
-  place_slots(frame, scene);
+void bin_into_tiles(Frame& frame, const Scene& scene, bool keep) {
+  if (keep) place_slots(frame, scene);
   const int visible = frame.visible, across = frame.tiles_x, tiles = across * frame.tiles_y, parts = scene.threads;
   // A part's counts by tile, with a column and a row more for the corners of rectangles, and a place for nothing.
   const int stride = across + 1, room = stride * (frame.tiles_y + 1) + 1, nowhere = room - 1;
   frame.histogram.need(static_cast<size_t>(parts) * room);
   frame.tile_begin.need(tiles + 1), frame.tile_used.need(tiles);
-  frame.list.need(frame.pairs + 1);
-  const auto stretch = [&](int part) { return static_cast<int>(static_cast<int64_t>(visible) * part / parts); };
   const auto counts = [&](int part) { return frame.histogram.data() + static_cast<size_t>(part) * room; };
+  const auto fetch = [&](uint32_t i) {
+    __builtin_prefetch(&frame.tile_columns[i]), __builtin_prefetch(&frame.tile_rows[i]);
+    if (keep) __builtin_prefetch(&frame.slot_begin[i]);
+  };
 
   parallel_for(scene.threads, parts, [&](int part) {
     uint32_t* count = counts(part);
     memset(count, 0, sizeof(uint32_t) * room);
-    for (int rank = stretch(part); rank < stretch(part + 1); rank++) {
-      const TileRect rect = frame.tiles[static_cast<uint32_t>(frame.order[rank])];
+    const int end = first_of(part + 1, parts, visible);
+    for (int rank = first_of(part, parts, visible); rank < end; rank++) {
+      if (rank + kAhead < end) fetch(static_cast<uint32_t>(frame.order[rank + kAhead]));
+      const TileRect rect(frame, static_cast<uint32_t>(frame.order[rank]));
       count[rect.y0 * stride + rect.x0]++, count[rect.y0 * stride + rect.x1]--;
       count[rect.y1 * stride + rect.x0]--, count[rect.y1 * stride + rect.x1]++;
     }
@@ -102,14 +120,17 @@ void bin_into_tiles(Frame& frame, const Scene& scene) {
     for (int part = 0; part < parts; part++)
       total += std::exchange(counts(part)[tile / across * stride + tile % across], total);
   }
-  frame.tile_begin[tiles] = total;
+  frame.tile_begin[tiles] = frame.pairs = total;
+  frame.list.need(total);
   parallel_for(scene.threads, parts, [&](int part) {
     uint32_t* position = counts(part);
     uint64_t unused;
-    for (int rank = stretch(part); rank < stretch(part + 1); rank++) {
+    const int end = first_of(part + 1, parts, visible);
+    for (int rank = first_of(part, parts, visible); rank < end; rank++) {
+      if (rank + kAhead < end) fetch(static_cast<uint32_t>(frame.order[rank + kAhead]));
       const uint32_t i = static_cast<uint32_t>(frame.order[rank]);
-      const TileRect rect = frame.tiles[i];
-      const uint64_t entry = static_cast<uint64_t>(frame.slot_begin[i]) << 32 | i, slot = 1ull << 32;
+      const TileRect rect(frame, i);
+      const uint64_t entry = (keep ? static_cast<uint64_t>(frame.slot_begin[i]) << 32 : 0) | i, slot = 1ull << 32;
       const int width = rect.x1 - rect.x0, height = rect.y1 - rect.y0;
       if (width <= 2 && height <= 2) {
         const int first = rect.y0 * stride + rect.x0;

@@ -37,12 +37,6 @@ struct TileView {
 // Four neighbouring pixels of one row of a block, as they stand in an image row.
 static inline void copy_quad(float* to, const float* from) { memcpy(to, from, kBlock * sizeof(float)); }
 
-// Square root, fast; of 1e-20 for less.
-static inline F root(F a) {
-  a = vmax(a, F(1e-20f));
-  return a * reciprocal_root(a);
-}
-
 // For kWidth splats with means relative to the tile: the blocks of the tile that each one's rectangle holds and its
 // ellipse {u^2 + v^2 <= L} reaches, exactly up to kSlack: L is lo - threshold + kSlack. Row by row of the tile: the
 // part of the ellipse between the first and the last pixel row of a block row is convex; its leftmost and rightmost

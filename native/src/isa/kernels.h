@@ -1,6 +1,7 @@
 // The functions that exist once per instruction set, and the table by which the library calls them.
 #pragma once
 #include "dispatch.h"
+#include "playback.h"
 #include "pool.h"
 #include "raster.h"
 #include "simd.h"
@@ -10,6 +11,8 @@ namespace tgb {
 namespace TGB_ISA {
 
 void project_forward(Frame& frame, const Scene& scene, int32_t* radii);
+void project_playback(Frame& frame, const Scene& scene, const Playback& avatar, const float* psi,
+                      const float* transforms);
 void composite_forward(Frame& frame, const Scene& scene, float* color, float* alpha, bool keep);
 void composite_backward(Frame& frame, const Scene& scene, const Gradients& gradients);
 void project_backward(Frame& frame, const Scene& scene, const Gradients& gradients);

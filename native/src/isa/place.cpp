@@ -1,6 +1,5 @@
 // The picture that a rendering is compared with: a frame of bytes, cut out by its matte, on a background.
-#include <vector>
-
+#include "buffer.h"
 #include "kernels.h"
 
 namespace tgb {
@@ -38,8 +37,8 @@ void place(const Picture& in, int factor, float* color, float* matte, int thread
   const float scale = 1.f / static_cast<float>(factor * factor);
   parallel_for(threads, imax(1, imin(threads, height)), [&](int part) {
     const int parts = imax(1, imin(threads, height));
-    std::vector<float> rows(static_cast<size_t>(10) * in.width);
-    float *background = rows.data(), *spread = background + 3 * in.width, *sums = spread + 3 * in.width;
+    Buffer<float> rows;
+    float *background = rows.need(static_cast<size_t>(10) * in.width), *spread = background + 3 * in.width, *sums = spread + 3 * in.width;
     float* matte_sums = sums + 3 * in.width;
     for (int x = 0; x < in.width; x++) memcpy(background + 3 * x, in.background, 3 * sizeof(float));
     const auto first = [&](int p) { return static_cast<int>(static_cast<int64_t>(height) * p / parts); };

@@ -10,6 +10,9 @@ namespace {
 struct Basis {
   alignas(64) float values[16][kWidth];
 };
+struct Colours {
+  alignas(64) float rgb[3][kWidth] = {};
+};
 
 template <int N>
 inline void weigh(const float* sh, const float basis[][kWidth], int lane, float* rgb) {
@@ -38,30 +41,42 @@ inline uint8_t colour(const Splats& splats, const Basis& basis, int i, int lane,
   return clamped;
 }
 
-// Lanes that may be drawn, and the harmonics towards the camera.
-inline uint32_t prepare(const View& view, const Scene& scene, int i, int count, Lanes& lanes, Basis& basis) {
+// Lanes that may be drawn, their records, and the harmonics towards the camera.
+inline uint32_t prepare(const View& view, const Scene& scene, int i, int count, Records& records, Basis& basis) {
   Projection p;
   project(view, scene, i, count, p);
   F opacity;
   load_structs<1>(scene.splats.opacities + i, count, &opacity);
-  const uint32_t visible = fill_lanes(scene, p, log2_of_opacity(opacity), (1u << count) - 1, lanes);
-  if (visible == 0) return 0;
+  const uint32_t candidates = make_records(scene, p, log2_of_opacity(opacity), (1u << count) - 1, records);
+  if (candidates == 0) return 0;
   Directions d;
   view_directions(view, scene.splats, p, i, count, d);
   F values[16];
   harmonics_basis<F>(scene.splats.sh_degree, d.local[0], d.local[1], d.local[2], values);
   const int n = (scene.splats.sh_degree + 1) * (scene.splats.sh_degree + 1);
   for (int k = 0; k < n; k++) store(basis.values[k], values[k]);
-  return visible;
+  return candidates;
 }
 
-// Fills the record of Gaussian i and returns whether it is drawn.
-inline bool make_record(Frame& frame, const Scene& scene, const Lanes& lanes, const Basis& basis, int i, int lane,
-                        int32_t& radius) {
-  if (!place_record(frame, scene, lanes, i, lane, radius)) return false;
-  Splat& s = frame.records[i];
-  frame.clamped[i] = colour(scene.splats, basis, i, lane, &s.r);
-  return __builtin_isfinite(s.r + s.g + s.b);
+// Projects `count` Gaussians from `i` on; returns how many are drawn.
+inline int project_group(const View& view, Frame& frame, const Scene& scene, int i, int count, int32_t* radii) {
+  Records records;
+  records.radius = F(0.f), records.drawn = gt(F(0.f), F(0.f));
+  Basis basis;
+  Colours colours;
+  for (uint32_t rest = prepare(view, scene, i, count, records, basis); rest != 0; rest &= rest - 1) {
+    const int lane = __builtin_ctz(rest);
+    float rgb[3];
+    frame.clamped[i + lane] = colour(scene.splats, basis, i + lane, lane, rgb);
+    for (int c = 0; c < 3; c++) colours.rgb[c][lane] = rgb[c];
+  }
+  if (radii != nullptr) {
+    alignas(64) float radius[kWidth];
+    store(radius, records.radius);
+    for (int lane = 0; lane < count; lane++) radii[i + lane] = static_cast<int32_t>(radius[lane]);
+  }
+  const F rgb[3] = {load(colours.rgb[0]), load(colours.rgb[1]), load(colours.rgb[2])};
+  return write_records(frame, records, rgb, i, count);
 }
 
 }  // namespace
@@ -69,26 +84,13 @@ inline bool make_record(Frame& frame, const Scene& scene, const Lanes& lanes, co
 void project_forward(Frame& frame, const Scene& scene, int32_t* radii) {
   const View view(scene);
   const int n = scene.splats.n;
-  const float threshold = log2f(scene.constants.alpha_min);
   begin_frame(frame, scene);
   parallel_for(scene.threads, chunks(n), [&](int chunk) {
-    Lanes lanes;
-    Basis basis;
-    int visible_here = 0;
+    int drawn = 0;
     const int end = imin(n, (chunk + 1) * kChunk);
-    for (int i = chunk * kChunk; i < end; i += kWidth) {
-      const int count = imin(kWidth, end - i);
-      const uint32_t candidates = prepare(view, scene, i, count, lanes, basis);
-      for (int lane = 0; lane < count; lane++) {
-        int32_t radius = 0;
-        bool drawn = (candidates >> lane & 1) && make_record(frame, scene, lanes, basis, i + lane, lane, radius);
-        drawn = drawn && lanes.lo[lane] >= threshold;
-        frame.drawn[i + lane] = drawn;
-        visible_here += drawn;
-        if (radii != nullptr) radii[i + lane] = radius;
-      }
-    }
-    frame.visible_before[chunk + 1] = visible_here;
+    for (int i = chunk * kChunk; i < end; i += kWidth)
+      drawn += project_group(view, frame, scene, i, imin(kWidth, end - i), radii);
+    frame.visible_before[chunk + 1] = drawn;
   });
 }
 

@@ -100,7 +100,7 @@ struct Directions {
 static inline void view_directions(const View& view, const Projection& p, const F* R, Directions& d) {
   for (int k = 0; k < 3; k++) d.world[k] = p.mean[k] - F(view.position[k]);
   const F* w = d.world;
-  d.inverse_length = F(1.f) / vsqrt(fma(w[0], w[0], fma(w[1], w[1], w[2] * w[2])));
+  d.inverse_length = reciprocal_root(fma(w[0], w[0], fma(w[1], w[1], w[2] * w[2])));
   for (int k = 0; k < 3; k++) d.world[k] = d.local[k] = d.world[k] * d.inverse_length;
   if (R == nullptr) return;
   for (int k = 0; k < 3; k++) d.local[k] = fma(R[k], w[0], fma(R[3 + k], w[1], R[6 + k] * w[2]));

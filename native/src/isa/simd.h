@@ -21,9 +21,16 @@ namespace TGB_ISA {
 
 static inline F& operator+=(F& a, F b) { return a = a + b; }
 static inline F operator-(F a) { return F(0.f) - a; }
+static inline F vfloor(F a) { return -vceil(-a); }
 static inline F clamp(F a, F lo, F hi) { return vmin(vmax(a, lo), hi); }
 static inline int imin(int a, int b) { return a < b ? a : b; }
 static inline int imax(int a, int b) { return a > b ? a : b; }
+
+// Square root, fast; of 1e-20 for less.
+static inline F root(F a) {
+  a = vmax(a, F(1e-20f));
+  return a * reciprocal_root(a);
+}
 
 // 2^x with a relative error below 3e-7 for x in [-126, 126]: 2^n times a degree-5 minimax polynomial of the rest.
 static inline F exp2(F x) {
@@ -62,6 +69,9 @@ static inline void load_structs(const float* p, int count, F* out) {
 
 template <int S>
 static inline void store_structs(float* p, int count, const F* in) {
+#if defined(__AVX512F__)
+  if (S == kWidth && count == kWidth) return store_transposed(p, in);
+#endif
   alignas(64) float t[S][kWidth];
   for (int s = 0; s < S; s++) store(t[s], in[s]);
   for (int i = 0; i < count; i++)

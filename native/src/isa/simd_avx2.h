@@ -92,6 +92,9 @@ static inline void join_bytes(const F* rows, uint64_t* out) {
     for (int i = 0; i < kWidth; i++) out[i] |= static_cast<uint64_t>(lanes[i]) << (8 * r);
   }
 }
+static inline void store_ints(int32_t* p, F a) {
+  _mm256_storeu_si256(reinterpret_cast<__m256i*>(p), _mm256_cvtps_epi32(a.v));
+}
 // p[0], p[S], p[2 S] ...
 template <int S>
 static inline F load_strided(const float* p) {

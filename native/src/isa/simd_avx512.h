@@ -127,6 +127,27 @@ static inline void join_bytes(const F* rows, uint64_t* out) {
   _mm512_storeu_si512(out, widen(_mm512_castsi512_si256(half[0]), _mm512_castsi512_si256(half[1])));
   _mm512_storeu_si512(out + 8, widen(_mm512_extracti64x4_epi64(half[0], 1), _mm512_extracti64x4_epi64(half[1], 1)));
 }
+// Writes 16 vectors as 16 structs of 16 floats.
+static inline void store_transposed(float* p, const F* in) {
+  __m512 a[16], b[16];
+  for (int i = 0; i < 16; i += 2)
+    a[i] = _mm512_unpacklo_ps(in[i].v, in[i + 1].v), a[i + 1] = _mm512_unpackhi_ps(in[i].v, in[i + 1].v);
+  for (int i = 0; i < 16; i += 4)
+    for (int j = 0; j < 2; j++) {
+      const __m512d x = _mm512_castps_pd(a[i + j]), y = _mm512_castps_pd(a[i + j + 2]);
+      b[i + 2 * j] = _mm512_castpd_ps(_mm512_unpacklo_pd(x, y));
+      b[i + 2 * j + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(x, y));
+    }
+  for (int k = 0; k < 4; k++) {  // b[4 i + k]: fields 4 i .. 4 i + 3 of structs k, k + 4, k + 8, k + 12
+    const __m512 low = _mm512_shuffle_f32x4(b[k], b[4 + k], 0x88), high = _mm512_shuffle_f32x4(b[k], b[4 + k], 0xDD);
+    const __m512 low2 = _mm512_shuffle_f32x4(b[8 + k], b[12 + k], 0x88), high2 = _mm512_shuffle_f32x4(b[8 + k], b[12 + k], 0xDD);
+    _mm512_storeu_ps(p + 16 * k, _mm512_shuffle_f32x4(low, low2, 0x88));
+    _mm512_storeu_ps(p + 16 * (k + 4), _mm512_shuffle_f32x4(high, high2, 0x88));
+    _mm512_storeu_ps(p + 16 * (k + 8), _mm512_shuffle_f32x4(low, low2, 0xDD));
+    _mm512_storeu_ps(p + 16 * (k + 12), _mm512_shuffle_f32x4(high, high2, 0xDD));
+  }
+}
+static inline void store_ints(int32_t* p, F a) { _mm512_storeu_si512(p, _mm512_cvtps_epi32(a.v)); }
 // p[0], p[S], p[2 S] ...
 template <int S>
 static inline F load_strided(const float* p) {

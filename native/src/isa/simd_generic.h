@@ -94,6 +94,10 @@ static inline void join_bytes(const F* rows, uint64_t* out) {
     for (int i = 0; i < kWidth; i++) out[i] |= static_cast<uint64_t>(lanes[i]) << (8 * r);
   }
 }
+static inline void store_ints(int32_t* p, F a) {
+  const v4i whole = __builtin_convertvector(a.v, v4i);
+  memcpy(p, &whole, 16);
+}
 // p[0], p[S], p[2 S] ...
 template <int S>
 static inline F load_strided(const float* p) {

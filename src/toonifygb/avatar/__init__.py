@@ -6,6 +6,7 @@ from toonifygb.avatar.bases import Mixer, check_bases
 from toonifygb.avatar.init import Views, init_avatar
 from toonifygb.avatar.model import POSE_DRIVERS, Avatar, PoseDrivers
 from toonifygb.avatar.mouth import MouthVolume
+from toonifygb.avatar.player import Player
 from toonifygb.avatar.poser import Poser
 from toonifygb.avatar.save import load, save
 
@@ -14,6 +15,7 @@ __all__ = [
     "Avatar",
     "Mixer",
     "MouthVolume",
+    "Player",
     "PoseDrivers",
     "Poser",
     "Views",

@@ -19,6 +19,13 @@ if TYPE_CHECKING:
     from toonifygb.structures import HeadMotion, Splats
 
 
+def joint_weights(avatar: Avatar) -> Float[Tensor, "n 5"]:
+    """Each Gaussian's share of every joint: face, upper mouth, lower mouth."""
+    upper = avatar.mouth_upper_weights.expand(avatar.mouth_upper.n, -1)
+    lower = avatar.mouth_lower_weights.expand(avatar.mouth_lower.n, -1)
+    return torch.cat([avatar.skin_weights, upper, lower])
+
+
 class Poser:
     """Poses one avatar many times.
 
@@ -37,10 +44,7 @@ class Poser:
         device = self._kernels.device
         self._neutral = join([avatar.neutral, avatar.mouth_upper, avatar.mouth_lower]).to(device)
         self._pose_basis = avatar.pose_basis.to(device)
-        weights = [avatar.skin_weights]
-        weights.append(avatar.mouth_upper_weights.expand(avatar.mouth_upper.n, -1))
-        weights.append(avatar.mouth_lower_weights.expand(avatar.mouth_lower.n, -1))
-        self._weights = torch.cat(weights).to(device)
+        self._weights = joint_weights(avatar).to(device)
         self._n_bases = avatar.n_bases
         dtype = torch.bfloat16 if half else torch.float32
         expression = cut(avatar.deltas, 0, self._n_bases)

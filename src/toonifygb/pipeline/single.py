@@ -135,7 +135,8 @@ def _render_video(request: RenderRequest, model: avatars.Avatar, viewer: AvatarV
     progress = reporter.stage("render", "rendering")
     size = viewer.camera.width
     with video.Writer(request.out, size, viewer.camera.height, sequence.fps) as writer:
-        for index in range(n):
-            swing = request.orbit_deg * math.sin(2 * math.pi * index / max(n, 1))
-            writer.write(viewer.frame(motion[index], request.yaw_deg + swing, request.pitch_deg))
-            progress.update(index + 1, n)
+        swings = [request.orbit_deg * math.sin(2 * math.pi * index / max(n, 1)) for index in range(n)]
+        angles = [(request.yaw_deg + swing, request.pitch_deg) for swing in swings]
+        for done, picture in enumerate(viewer.play(motion[:n], angles), start=1):
+            writer.write(picture)
+            progress.update(done, n)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
 
 from toonifygb import avatar as avatars
-from toonifygb import render
 from toonifygb.errors import InputError
 from toonifygb.geometry import cameras
 from toonifygb.structures import Camera, HeadMotion
@@ -27,8 +26,7 @@ class AvatarViewer:
         threads: int | None = None,
     ) -> None:
         self.model = model
-        self._poser = avatars.Poser(model, backend=backend, threads=threads)
-        self.renderer = render.get(backend, threads)
+        self._player = avatars.Player(model, backend=backend, threads=threads)
         self.background = background
         self.size = size
         self.look_through(model.camera)
@@ -49,15 +47,24 @@ class AvatarViewer:
             angles_deg: (yaw, pitch) of each view about the head, degrees: yaw turns it towards the subject's left,
                 pitch upwards; (0, 0) is the camera itself.
         """
-        splats = self._poser(motion)
+        views = [self._orbit(motion, *angles) for angles in angles_deg]
+        return [to_uint8(image.color) for image in self._player.render(motion, views, background=self.background)]
+
+    def play(self, motion: HeadMotion, angles_deg: Sequence[tuple[float, float]]) -> Iterator[np.ndarray]:
+        """uint8 RGB pictures of pose after pose, each from its view.
+
+        Args:
+            motion: leading axis = time.
+            angles_deg: of each pose, as in ``frames``.
+        """
+        views = (self._orbit(motion[index], *angles) for index, angles in enumerate(angles_deg))
+        for image in self._player.play(motion, views, background=self.background):
+            yield to_uint8(image.color)
+
+    def _orbit(self, motion: HeadMotion, yaw_deg: float, pitch_deg: float) -> Camera:
+        """The camera turned about the head of one pose."""
         pivot = motion.translation + self.model.rest_joints[0]
-        pictures = []
-        with torch.no_grad():
-            for yaw, pitch in angles_deg:
-                camera = cameras.orbit(self.camera, pivot, math.radians(yaw), math.radians(pitch))
-                image = self.renderer.render(splats, camera, background=self.background)
-                pictures.append(to_uint8(image.color))
-        return pictures
+        return cameras.orbit(self.camera, pivot, math.radians(yaw_deg), math.radians(pitch_deg))
 
 
 _JAW_OPEN_RAD = 0.426

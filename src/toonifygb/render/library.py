@@ -128,6 +128,25 @@ class SkinGradient(Structure):
     _fields_ = [(name, c_void_p) for name in ("means", "quats", "log_scales", "opacity_logits")]
 
 
+class DeltaGroup(Structure):
+    """Mirrors ``tgb::DeltaGroup`` of native/src/playback.h."""
+
+    _fields_ = [
+        *((name, c_int32) for name in ("first", "width", "bytes")),
+        *((name, c_void_p) for name in ("begin", "row", "steps", "levels")),
+    ]
+
+
+class Playback(Structure):
+    """Mirrors ``tgb::Playback``."""
+
+    _fields_ = [
+        *((name, c_int32) for name in ("n", "rows", "sh_degree")),
+        *((name, c_void_p) for name in ("neutral", "weights")),
+        ("groups", DeltaGroup * 3),
+    ]
+
+
 _SIGNATURES = {
     "tgb_isa": (c_char_p, []),
     "tgb_set_isa": (c_int32, [c_char_p]),
@@ -135,6 +154,10 @@ _SIGNATURES = {
     "tgb_raster_backward": (c_int32, [c_void_p, POINTER(Scene), POINTER(Gradients), POINTER(c_double)]),
     "tgb_raster_release": (None, [c_void_p]),
     "tgb_raster_counts": (None, [c_void_p, POINTER(c_int32)]),
+    "tgb_play": (
+        c_int32,
+        [POINTER(Playback), c_void_p, c_void_p, POINTER(Scene), c_void_p, c_void_p, POINTER(c_double)],
+    ),
     "tgb_measure_flops": (c_double, []),
     "tgb_blend": (None, [c_void_p, c_void_p, c_int32, c_void_p, c_int32, c_int64, c_void_p, c_int32]),
     "tgb_add_blends": (None, [c_void_p, c_void_p, c_int32, c_int32, c_int64, c_void_p, c_int64, c_int32]),

@@ -51,7 +51,8 @@ class _View:
     info: RenderInfo | None
 
 
-def _native_camera(camera: Camera) -> library.Camera:
+def native_camera(camera: Camera) -> library.Camera:
+    """The camera as the engine reads it."""
     K, rows = camera.K.tolist(), camera.world_to_camera[:3].flatten().tolist()
     native = library.Camera(
         fx=K[0][0], fy=K[1][1], cx=K[0][2], cy=K[1][2], width=camera.width, height=camera.height
@@ -146,7 +147,7 @@ class NativeRenderer:
     ) -> Rendering:
         """Image of ``splats`` seen by ``camera``; see ``Renderer.render``."""
         view = _View(
-            camera=_native_camera(camera),
+            camera=native_camera(camera),
             constants=library.Constants(*astuple(constants)),
             sh_degree=check_splats(splats, sh_degree),
             threads=self.threads,
