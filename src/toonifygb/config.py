@@ -259,7 +259,14 @@ WHOLE_PICTURE = 100.0
 """A ``crop_scale`` with which the largest square of the picture is taken, whatever the face's size."""
 DRAFT = TrainConfig()
 STANDARD = TrainConfig(
-    n_gaussians=32_000, n_mouth_gaussians=4_000, resolution=512, steps=6_000, coarse_share=0.5, dropout=0.3
+    n_gaussians=32_000,
+    n_mouth_gaussians=4_000,
+    resolution=512,
+    steps=6_000,
+    coarse_share=0.5,
+    dropout=0.3,
+    l1_weight=0.6,
+    dssim_weight=0.4,
 )
 PAPER = TrainConfig(
     n_gaussians=50_000,
@@ -269,6 +276,8 @@ PAPER = TrainConfig(
     sh_degree=3,
     coarse_share=0.5,
     dropout=0.3,
+    l1_weight=0.6,
+    dssim_weight=0.4,
 )
 PRESETS: dict[Quality, TrainConfig] = {"draft": DRAFT, "standard": STANDARD, "paper": PAPER}
 
