@@ -59,12 +59,7 @@ class Player:
             background: see ``Renderer.render``.
         """
         with torch.no_grad():
-            if self._playback is None:
-                assert self._poser is not None
-                splats = self._poser(motion)
-                return [self._renderer.render(splats, camera, background=background) for camera in cameras]
-            psi, transforms = self._pose(motion)
-            return [self._playback.render(psi, transforms, camera, background=background) for camera in cameras]
+            return self._draw(self._pose(motion), cameras, background)
 
     def play(
         self, motion: HeadMotion, cameras: Iterable[Camera], *, background: Float[Tensor, " 3"] | None = None
@@ -78,39 +73,53 @@ class Player:
             cameras: one per pose; the shorter of both ends the play.
             background: see ``Renderer.render``.
         """
-        playback, views = self._playback, iter(cameras)
+        views = iter(cameras)
         for start in range(0, motion.joints.shape[0], _AHEAD):
-            some = motion[start : start + _AHEAD]
-            if playback is None:
-                for index, camera in zip(range(some.joints.shape[0]), views, strict=False):
-                    yield self.render(some[index], [camera], background=background)[0]
-            else:
+            with torch.no_grad():
+                poses = zip(*self._pose(motion[start : start + _AHEAD]), strict=True)
+            for pose, camera in zip(poses, views, strict=False):
                 with torch.no_grad():
-                    poses = zip(*self._pose(some), strict=True)
-                for (psi, transforms), camera in zip(poses, views, strict=False):
-                    yield playback.render(psi, transforms, camera, background=background)
+                    [image] = self._draw(pose, [camera], background)
+                yield image
 
-    def _pose(self, motion: HeadMotion) -> tuple[Float[Tensor, "*b r"], Float[Tensor, "*b 5 4 4"]]:
-        """What a pose means for the rows of the deltas, and for the joints."""
+    def _pose(self, motion: HeadMotion) -> tuple[Tensor, ...]:
+        """What motions mean for the rows of the deltas, the pose correctives and the joints."""
         avatar = self._avatar
-        psi = torch.cat([avatar.coefficients(motion), avatar.pose_feature(motion)], dim=-1)
-        return psi, avatar.transforms(motion)
+        return avatar.coefficients(motion), avatar.pose_feature(motion), avatar.transforms(motion)
+
+    def _draw(
+        self, pose: tuple[Tensor, ...], cameras: Sequence[Camera], background: Float[Tensor, " 3"] | None
+    ) -> list[Rendering]:
+        coefficients, feature, transforms = pose
+        if self._playback is not None:
+            psi = torch.cat([coefficients, feature])
+            return [self._playback.render(psi, transforms, camera, background=background) for camera in cameras]
+        assert self._poser is not None
+        splats = self._poser.splats(coefficients, feature, transforms)
+        return [self._renderer.render(splats, camera, background=background) for camera in cameras]
 
 
 def playback_model(avatar: Avatar) -> PlaybackModel:
     """An avatar as the native engine plays it: rows are its deltas, then its pose correctives."""
-    neutral = join([avatar.neutral, avatar.mouth_upper, avatar.mouth_lower])
-    rows = [_channels(avatar.deltas.map(lambda delta, k=k: delta[k])) for k in range(len(avatar.deltas.means))]
-    rows += [torch.nn.functional.pad(moves, (0, rows[0].shape[1] - 3)) for moves in avatar.pose_basis]
-    cuts = ((0, _POSITION, torch.int16), (_POSITION, _SHAPE, torch.int8), (_SHAPE, rows[0].shape[1], torch.int8))
-    first, second, third = (_levels(rows, *cut, n=avatar.n) for cut in cuts)
+    deltas, n_rows = avatar.deltas, len(avatar.deltas.means) + len(avatar.pose_basis)
+
+    def levels(first: int, dtype: torch.dtype, *fields: Tensor) -> PlaybackDeltas:
+        """Of channels that lie side by side; one row at a time, because all of them would be another avatar."""
+        rows = (torch.cat([field[k].flatten(1) for field in fields], dim=1) for k in range(len(fields[0])))
+        return _levels(rows, n_rows, first, dtype, avatar.n)
+
+    opacity, base, rest = deltas.opacity_logits[..., None], deltas.sh[:, :, :1], deltas.sh[:, :, 1:]
     return PlaybackModel(
         n=avatar.n,
-        rows=len(rows),
+        rows=n_rows,
         sh_degree=avatar.sh_degree,
-        neutral=_blocks(_channels(neutral)),
+        neutral=_blocks(_channels(join([avatar.neutral, avatar.mouth_upper, avatar.mouth_lower]))),
         weights=_blocks(joint_weights(avatar)),
-        deltas=(first, second, third),
+        deltas=(
+            levels(0, torch.int16, torch.cat([deltas.means, avatar.pose_basis])),
+            levels(_POSITION, torch.int8, deltas.quats, deltas.log_scales, opacity, base),
+            levels(_SHAPE, torch.int8, rest),
+        ),
     )
 
 
@@ -128,27 +137,26 @@ def _blocks(values: Tensor) -> Tensor:
 
 
 def _levels(
-    rows: list[Float[Tensor, "f c"]], start: int, stop: int, dtype: torch.dtype, *, n: int
+    rows: Iterable[Float[Tensor, "f w"]], n_rows: int, first: int, dtype: torch.dtype, n: int
 ) -> PlaybackDeltas:
-    """Channels ``start`` to ``stop`` of all rows, of which the first f of n Gaussians have any."""
-    width, blocks = stop - start, -(-n // BLOCK)
-    steps, found = torch.zeros(width, len(rows)), []
-    live = torch.zeros(len(rows), blocks, dtype=torch.bool)
+    """Channels from ``first`` on of the rows that have them, of which the first f of n Gaussians have any."""
+    blocks, steps, found = -(-n // BLOCK), [], []
+    live = torch.zeros(n_rows, blocks, dtype=torch.bool)
     for k, row in enumerate(rows):
-        values = row[:, start:stop]
-        steps[:, k] = values.abs().amax(0) / torch.iinfo(dtype).max
-        levels = (values / steps[:, k].clamp_min(torch.finfo(torch.float32).tiny)).round().to(dtype)
+        steps.append(row.abs().amax(0) / torch.iinfo(dtype).max)
+        levels = (row / steps[k].clamp_min(torch.finfo(row.dtype).tiny)).round().to(dtype)
         levels = _blocks(torch.nn.functional.pad(levels, (0, 0, 0, n - len(levels))))
         live[k] = levels.flatten(1).any(1)
         found.append(levels[live[k]])
+    width, count = len(steps[0]), live.sum(0)
     block, row_of = live.T.nonzero(as_tuple=True)  # the order of entries; `found` is row by row
-    count = live.sum(0)
     begin = torch.cat([count.new_zeros(1), count.cumsum(0)])
     place = torch.zeros(live.shape, dtype=torch.long)
     place[row_of, block] = torch.arange(len(block)) - begin[block]
     at_block = live.nonzero()[:, 1]
-    channel = torch.arange(width)
-    to = begin[at_block, None] * width + channel * count[at_block, None] + place[live][:, None]
+    to = begin[at_block, None] * width + torch.arange(width) * count[at_block, None] + place[live][:, None]
     levels = torch.empty(len(block) * width, BLOCK, dtype=dtype)
     levels[to.flatten()] = torch.cat(found).view(len(levels), BLOCK)
-    return PlaybackDeltas(start, begin.int(), row_of.int().contiguous(), steps, levels.flatten())
+    padded = torch.zeros(width, n_rows)
+    padded[:, : len(steps)] = torch.stack(steps, dim=1)
+    return PlaybackDeltas(first, begin.int(), row_of.int().contiguous(), padded, levels.flatten())

@@ -54,13 +54,19 @@ class Poser:
 
     def __call__(self, motion: HeadMotion) -> Splats:
         """Splats in the world for one frame's motion, as ``Avatar.pose`` gives them; without gradients."""
-        avatar, device = self._avatar, self._kernels.device
+        avatar = self._avatar
         with torch.no_grad():
-            # A few dozen numbers: the processor has them before a device would have started.
-            psi = avatar.coefficients(motion).to(device)
-            feature, transforms = avatar.pose_feature(motion).to(device), avatar.transforms(motion).to(device)
+            return self.splats(avatar.coefficients(motion), avatar.pose_feature(motion), avatar.transforms(motion))
+
+    def splats(
+        self, coefficients: Float[Tensor, " r"], feature: Float[Tensor, " p"], transforms: Float[Tensor, "5 4 4"]
+    ) -> Splats:
+        """The same from ``coefficients``, ``pose_feature`` and ``transforms`` of the avatar."""
+        device = self._kernels.device
+        psi, feature, transforms = (tensor.to(device) for tensor in (coefficients, feature, transforms))
+        with torch.no_grad():
             raw = self._blend([psi[: self._n_bases].contiguous(), psi[self._n_bases :].contiguous()])
-            face = raw.means[: avatar.neutral.n]
+            face = raw.means[: self._avatar.neutral.n]
             face += pose_offsets(feature, self._pose_basis)
             return self._kernels.skin(raw, self._weights, transforms)
 
