@@ -39,7 +39,7 @@ def test_kernels_and_training(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_everything(tmp_path: Path) -> None:
     claims = " ".join(row["claim"] for row in rehearse(tmp_path))
-    for said in ("contract tests passed", "blend", "pose + render", "training steps", "PSNR, held out", "bfloat16"):
+    for said in ("contract tests passed", "blend", "animate + render", "training steps", "PSNR, held out", "bfloat16"):
         assert said in claims
 
 
