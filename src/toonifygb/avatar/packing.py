@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 from toonifygb.avatar.fields import FIELDS, each
@@ -26,7 +27,6 @@ LEVELS, REST_LEVELS = 127, 15
 _SHAPES = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": (), "sh": (-1, 3)}
 REST = "sh_rest"
 """Stored beside ``sh``, which then is the base colour alone; avatars written before have all colour in ``sh``."""
-_BITS = 8
 
 
 def pack(deltas: GaussianParams) -> dict[str, Tensor]:
@@ -90,11 +90,9 @@ def names(with_rest: bool) -> set[str]:
 
 def _bits(live: Tensor) -> UInt8[Tensor, "k b"]:
     """Truth values, eight to the byte, the first in the lowest bit."""
-    padded = torch.nn.functional.pad(live.to(torch.uint8), (0, -live.shape[1] % _BITS))
-    return (padded.view(len(live), -1, _BITS) << torch.arange(_BITS, dtype=torch.uint8)).sum(-1, dtype=torch.uint8)
+    return torch.from_numpy(np.packbits(live.numpy(), axis=1, bitorder="little"))
 
 
 def _truth(bits: UInt8[Tensor, "k b"], n: int) -> Tensor:
     """The first ``n`` truth values of each row of ``_bits``."""
-    apart = (bits[..., None] >> torch.arange(_BITS, dtype=torch.uint8)) & 1
-    return apart.flatten(1)[:, :n].bool()
+    return torch.from_numpy(np.unpackbits(bits.numpy(), axis=1, count=n, bitorder="little")).bool()
