@@ -39,8 +39,9 @@ def test_kernels_and_training(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_everything(tmp_path: Path) -> None:
     claims = " ".join(row["claim"] for row in rehearse(tmp_path))
-    for said in ("contract tests passed", "blend", "animate + render", "training steps", "PSNR, held out", "bfloat16"):
-        assert said in claims
+    said = ("contract tests passed", "blend", "animate + render", "training steps", "PSNR, held out", "bfloat16")
+    for claim in said:
+        assert claim in claims
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
