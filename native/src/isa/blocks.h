@@ -42,8 +42,7 @@ static inline void copy_quad(float* to, const float* from) { memcpy(to, from, kB
 // part of the ellipse between the first and the last pixel row of a block row is convex; its leftmost and rightmost
 // points are those of the whole ellipse where they are in there, else on the edge nearer to them.
 static inline void block_masks(const Splat* splats, const TileView& view, float threshold, uint64_t* masks) {
-  constexpr int kStride = sizeof(Splat) / sizeof(float);
-  const auto field = [&](float Splat::*member) { return load_strided<kStride>(&(splats->*member)); };
+  const auto field = [&](float Splat::*member) { return load_strided<kSplatFloats>(&(splats->*member)); };
   const F mx = field(&Splat::mx), my = field(&Splat::my), vy = field(&Splat::vy), width = field(&Splat::width);
   const F tip = field(&Splat::tip), lean = field(&Splat::uy) * width;
   const F reach = field(&Splat::lo) + F(kSlack - threshold), zero(0.f), one(1.f), quarter(1.f / kBlock);

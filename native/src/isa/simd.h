@@ -26,6 +26,18 @@ static inline F clamp(F a, F lo, F hi) { return vmin(vmax(a, lo), hi); }
 static inline int imin(int a, int b) { return a < b ? a : b; }
 static inline int imax(int a, int b) { return a > b ? a : b; }
 
+#if !defined(__AVX512F__)
+// out[lane] = the lane of eight vectors of whole numbers 0..255 as bytes, rows[0] lowest.
+static inline void join_bytes(const F* rows, uint64_t* out) {
+  alignas(64) float lanes[kWidth];
+  memset(out, 0, kWidth * sizeof(uint64_t));
+  for (int r = 0; r < 8; r++) {
+    store(lanes, rows[r]);
+    for (int i = 0; i < kWidth; i++) out[i] |= static_cast<uint64_t>(lanes[i]) << (8 * r);
+  }
+}
+#endif
+
 // Square root, fast; of 1e-20 for less.
 static inline F root(F a) {
   a = vmax(a, F(1e-20f));

@@ -83,15 +83,6 @@ static inline void sum4(float* out, F a, F b, F c, F d) {
   const __m256 x = _mm256_add_ps(_mm256_castpd_ps(lo), _mm256_castpd_ps(hi));
   _mm_storeu_ps(out, _mm_add_ps(_mm256_castps256_ps128(x), _mm256_extractf128_ps(x, 1)));
 }
-// out[lane] = the lane of eight vectors of whole numbers 0..255 as bytes, rows[0] lowest.
-static inline void join_bytes(const F* rows, uint64_t* out) {
-  alignas(32) float lanes[kWidth];
-  memset(out, 0, kWidth * sizeof(uint64_t));
-  for (int r = 0; r < 8; r++) {
-    store(lanes, rows[r]);
-    for (int i = 0; i < kWidth; i++) out[i] |= static_cast<uint64_t>(lanes[i]) << (8 * r);
-  }
-}
 static inline void store_ints(int32_t* p, F a) {
   _mm256_storeu_si256(reinterpret_cast<__m256i*>(p), _mm256_cvtps_epi32(a.v));
 }

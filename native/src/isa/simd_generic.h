@@ -85,15 +85,6 @@ static inline float sum(F a) { return (a.v[0] + a.v[1]) + (a.v[2] + a.v[3]); }
 static inline void sum4(float* out, F a, F b, F c, F d) {
   out[0] = sum(a), out[1] = sum(b), out[2] = sum(c), out[3] = sum(d);
 }
-// out[lane] = the lane of eight vectors of whole numbers 0..255 as bytes, rows[0] lowest.
-static inline void join_bytes(const F* rows, uint64_t* out) {
-  alignas(32) float lanes[kWidth];
-  memset(out, 0, kWidth * sizeof(uint64_t));
-  for (int r = 0; r < 8; r++) {
-    store(lanes, rows[r]);
-    for (int i = 0; i < kWidth; i++) out[i] |= static_cast<uint64_t>(lanes[i]) << (8 * r);
-  }
-}
 static inline void store_ints(int32_t* p, F a) {
   const v4i whole = __builtin_convertvector(a.v, v4i);
   memcpy(p, &whole, 16);

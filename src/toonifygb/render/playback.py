@@ -6,7 +6,6 @@ projected before the next block is read. The slow twin is ``Renderer.render`` on
 
 from __future__ import annotations
 
-from ctypes import c_float
 from dataclasses import astuple, dataclass
 from typing import TYPE_CHECKING
 
@@ -128,7 +127,8 @@ class NativePlayback:
             camera=native_camera(camera), constants=library.Constants(*astuple(constants)), threads=self.threads
         )
         scene.splats.sh_degree = self._model.sh_degree
-        scene.background = (c_float * 3)(*([0.0] * 3 if background is None else background.tolist()))
+        if background is not None:
+            scene.background[:] = background.tolist()
         color = torch.empty(camera.height, camera.width, 3)
         alpha = torch.empty(camera.height, camera.width)
         if not self._engine.tgb_play(
